@@ -51,7 +51,7 @@ def one(file: Path, count: int, coloured: bool, back: bool) -> dict[str, float]:
         start, worked = time.perf_counter(), time.process_time()
         nearest = nearest_gaussians(load_point_cloud(file).points, gaussians)
         ids = {"object_id": nearest.astype(np.int32), "class_id": (nearest % 50).astype(np.int32)}
-        save_point_cloud(file.with_name("out.laz"), file, np.arange(count), ids, "")
+        save_point_cloud(file.with_name("out.laz"), file, np.arange(count), ids)
         told["labels back to .laz, s"] = time.perf_counter() - start
         told["of CPU, s"] = time.process_time() - worked
         told["points without a Gaussian"] = int((nearest < 0).sum())

@@ -149,7 +149,7 @@ def _images(folder: Path) -> None:
 
 
 def _read_image(file: Path) -> np.ndarray:
-    found, _ = images.read_image(file)
+    found = images.read_image(file)
     assert found.shape[1::-1] == images.image_header(file).upright
     return found
 
@@ -167,16 +167,15 @@ def _masks(folder: Path) -> None:
         "deep": lambda ids: cv2.imencode(".png", (ids * 9000).astype(np.uint16))[1].tobytes(),
         "colour": lambda ids: cv2.imencode(".png", np.stack([ids, ids * 9, ids * 0], -1).astype(np.uint8))[1].tobytes(),
         "palette": lambda ids: png(ids, bits=4, colour_type=3, palette=bytes(range(48))),
-        "bits": lambda ids: png(ids % 4, bits=2, colour_type=0),
+        "bits": lambda ids: png(ids % 2, bits=1, colour_type=0),
     }
-    for kind in (*kinds, "levels", "objects/001", "objects/002"):
+    for kind in (*kinds, "objects/001", "objects/002"):
         (folder / kind).mkdir(parents=True)
     for name, image in zip(NAMES, ids):
         for kind, write in kinds.items():
             (folder / kind / f"{name}.png").write_bytes(write(image))
         for number in (1, 2):
             cv2.imwrite(str(folder / f"objects/00{number}/{name}.png"), 255 * (image == number).astype(np.uint8))
-        np.save(folder / "levels" / f"{name}_s.npy", np.broadcast_to(image - 1, (4, *MASK_SIZE)).astype(np.float32))
 
 
 def _proposals(folder: Path) -> None:
@@ -191,6 +190,10 @@ def _proposals(folder: Path) -> None:
         "b": {"images": [{"width": 30, "height": 20}], "annotations": polygons},
     }.items():
         (folder / "sam" / f"{name}.json").write_text(json.dumps(content))
+    (folder / "levels").mkdir()
+    for name in NAMES:
+        levels = np.broadcast_to(boxes[0] * 2 + boxes[1] - 1.0, (4, 20, 30)).astype(np.float32)
+        np.save(folder / "levels" / f"{name}_s.npy", levels)
 
 
 def _read_proposals(folder: Path) -> list[np.ndarray]:
@@ -251,7 +254,7 @@ def _videos(folder: Path) -> None:
 def _read_video(file: Path) -> list[np.ndarray]:
     frames = file.with_suffix("")
     shutil.rmtree(frames, ignore_errors=True)
-    found = [cv2.imread(str(frame)) for frame in video.write_frames(file, frames, frames=3)[0]]
+    found = [cv2.imread(str(frame)) for frame in video.write_frames(file, frames, 3)[0]]
     assert 1 <= len(found) <= 3
     return found
 

@@ -66,7 +66,6 @@ def test_mixed_exif_orientations_come_upright(tmp_path):
     read = load_capture(tmp_path)
     np.testing.assert_array_equal(read.frames, capture.frames)
     assert {(file.width, file.height) for file in read.files} == {(24, 16)}
-    assert any("7 images were turned upright" in note for note in read.notes)
 
 
 @pytest.mark.parametrize(("orientation", "upright"), [(3, False), (6, False), (6, True)])
@@ -77,26 +76,6 @@ def test_poses_of_stored_pixels_keep_them(tmp_path, orientation, upright):
     write_turned(capture, tmp_path / "images", [orientation, 1, 1], upright=upright)
     read = load_capture(tmp_path)
     np.testing.assert_array_equal(read.frames, capture.frames)
-    assert any(("turned upright" if upright else "as they are stored") in note for note in read.notes)
-
-
-def test_a_file_without_a_size_means_the_pixels_that_its_centre_lies_in_the_middle_of(tmp_path):
-    """Of photographs that lie on their side, stored and upright; depth is measured like the stored pixels."""
-    capture = small_capture(3)
-    write_turned(capture, tmp_path / "images", [6, 8, 1], upright=False)
-    content = transforms(capture)
-    del content["w"], content["h"]
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    np.testing.assert_array_equal(load_capture(tmp_path).frames, capture.frames)
-    write_turned(capture, tmp_path / "images", [6, 8, 1], upright=True)
-    depth = np.arange(24 * 16, dtype=np.uint16).reshape(16, 24) + 1000
-    for n, (entry, turns) in enumerate(zip(content["frames"], (1, 3, 0))):
-        entry["depth_file_path"] = f"depth_{n}.npy"
-        np.save(tmp_path / entry["depth_file_path"], np.rot90(depth, turns))
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    read = load_capture(tmp_path)
-    np.testing.assert_array_equal(read.frames, capture.frames)
-    np.testing.assert_allclose(read.depths, np.broadcast_to(0.001 * depth, (3, 16, 24)), rtol=1e-5)
 
 
 SHIFT = np.array([1e7, -5411876.6, 312.25])

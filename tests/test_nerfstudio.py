@@ -151,7 +151,7 @@ def test_a_lost_pose_is_left_out_and_counted(tmp_path, value):
 
     loaded = load_changed(tmp_path, lose, holdout=0)
     assert loaded.names == (CAPTURE.names[0], *CAPTURE.names[2:])
-    assert "1 frames were left out: their poses" in loaded.notes[0]
+    assert "1 of 5 frames were left out: they have no pose" in loaded.notes[0]
 
 
 @pytest.mark.parametrize(("key", "value", "axis"), [

@@ -77,9 +77,9 @@ def test_labels_go_back_in_order_and_place(tmp_path, source):
     is_las = source.suffix in (".las", ".laz")
     if not is_las:
         with refused("out.laz", source.name, "Write a .ply"):
-            save_point_cloud(tmp_path / "out.laz", source, rows, ids, crs)
+            save_point_cloud(tmp_path / "out.laz", source, rows, ids)
     for out in (tmp_path / f"out{suffix}" for suffix in ((".las", ".laz", ".ply") if is_las else (".ply",))):
-        save_point_cloud(out, source, rows, ids, crs)
+        save_point_cloud(out, source, rows, ids)
         before, after = load_point_cloud(source), load_point_cloud(out)
         np.testing.assert_allclose(after.points, before.points, rtol=0, atol=0)
         np.testing.assert_array_equal(after.colors, colours)
@@ -124,15 +124,15 @@ def test_labels_replace_older_ones_and_points_without_a_place_are_kept_in_a_ply(
     las(tmp_path / "a.las", points, colours)
     for n in (1, 2):
         ids = {"object_id": np.full(60, n, np.int32)}
-        save_point_cloud(tmp_path / "a.las", tmp_path / "a.las", np.arange(60), ids, "")
+        save_point_cloud(tmp_path / "a.las", tmp_path / "a.las", np.arange(60), ids)
         np.testing.assert_array_equal(laspy.read(tmp_path / "a.las").object_id, n)
     points[3] = np.nan
     WRITERS["binary.pcd"](tmp_path / "a.pcd", points, colours)
     assert read_gaussians(tmp_path / "a.pcd")[0].count == 59
-    save_point_cloud(tmp_path / "b.ply", tmp_path / "a.pcd", np.arange(60), ids, "")
+    save_point_cloud(tmp_path / "b.ply", tmp_path / "a.pcd", np.arange(60), ids)
     np.testing.assert_array_equal(load_point_cloud(tmp_path / "b.ply").points, points)
     with refused("a.las", "near the Gaussians"):
-        save_point_cloud(tmp_path / "b.las", tmp_path / "a.las", np.arange(0), {}, "")
+        save_point_cloud(tmp_path / "b.las", tmp_path / "a.las", np.arange(0), {})
 
 
 def test_what_cannot_be_read_is_said(tmp_path, monkeypatch):

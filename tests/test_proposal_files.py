@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capture_files import refused
 from hypothesis import given, settings, strategies as st
 
 from jsecon.read.masks.masks import load_labels, load_proposals
@@ -51,16 +52,10 @@ def test_langsplat_files_hold_one_layer(tmp_path, masks):
         np.testing.assert_array_equal(read(0), masks[[n]])
 
 
-def test_masks_of_single_frames_are_regions_of_their_own(tmp_path, masks):
-    """SAM's masks given as tracked ones: the best lies on top, and no region is in two frames."""
-    for name, scores in (("a", [0.8, 0.95, 0.9]), ("b", [0.95, 0.8, 0.9])):
-        (tmp_path / f"{name}.json").write_text(json.dumps(records(masks, scores)))
-    labels, ids, notes = load_labels(tmp_path, ("a", "b"), SIZE)
-    assert len(ids) == 5  # the second of b lies under the first
-    np.testing.assert_array_equal(labels[0][masks[1]], 0)
-    np.testing.assert_array_equal(labels[0] == 2, masks[0] & ~masks[1])
-    np.testing.assert_array_equal(labels[1] == 3, masks[0])
-    assert any("regions of their own" in note for note in notes)
+def test_masks_of_single_frames_are_no_tracked_ones(tmp_path, masks):
+    (tmp_path / "a.json").write_text(json.dumps(records(masks)))
+    with refused("a.json", "single frame", "--proposals"):
+        load_labels(tmp_path, ("a",), SIZE)
 
 
 def runs_of(mask) -> list[int]:

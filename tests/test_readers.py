@@ -99,33 +99,32 @@ DAMAGE = {
     "colmap/text": [
         (put(CAMERAS, "1 EQUIRECTANGULAR 24 16 24 16"), "cameras.txt", "24x16", "twice as wide as high"),
         *((put(CAMERAS, f"1 {name} 24 16 24 16"), name, "image_undistorter") for name in ("NEW_FISHEYE", "FOV")),
-        (put(CAMERAS, "1 PINHOLE 24 16 0.9 0.9 0.5 0.5"), "cameras.txt", "give it in pixels"),
+        (put(CAMERAS, "1 PINHOLE 24 16 0.9 0.9 0.5 0.5"), "cameras.txt", "give them in pixels"),
     ],
     "colmap/binary": [
         (numbers("sparse/0/cameras.bin", 12, "<i", 99), "cameras.bin", "99", "image_undistorter"),
-        (numbers("sparse/0/cameras.bin", 32, "<4d", 0.9, 0.9, 0.5, 0.5), "cameras.bin", "give it in pixels"),
-        (put(IMAGES, None), "no images.bin"),
+        (numbers("sparse/0/cameras.bin", 32, "<4d", 0.9, 0.9, 0.5, 0.5), "cameras.bin", "give them in pixels"),
+        (put(IMAGES, None), "images.txt", "No such file"),
         (swap(IMAGES, b"frame_000.png\0", b"../me_000.png\0"), "leads out"),
         (put("images/frame_000.png", POINTER), "frame_000.png"),
     ],
     "nerfstudio/plain": [
         (key(JSON, GONE, *POSE), "frame_001.png) cannot be read ('transform_matrix' is"),
-        (key(JSON, [], "frames"), "no frame"), (key(JSON, "wide", "w"), "wide"),
+        (key(JSON, [], "frames"), "of its 0 frames"), (key(JSON, "wide", "w"), "wide"),
         (key(JSON, MIRROR, *POSE), "not rigid"), (key(JSON, SCALED, *POSE), "not rigid"),
         (key(JSON, [[1, 2], [3, 4]], *POSE), "shape (2, 2)"), (key(JSON, [0, 0, 0], "up"), "not all 0"),
         (key(JSON, GONE, "camera_angle_x"), "no focal length", "camera_angle_x"),
         (key(JSON, 4.0, "camera_angle_x"), "camera_angle_x = 4.0"), (key(JSON, 0.1, "k4"), JSON, "k4"),
         (key(JSON, "EQUIRECTANGULAR", "camera_model"), "twice as wide"),
         (key(JSON, 0.1, "ftheta_p0"), JSON, "ftheta_p0"),
-        (lambda entry: shutil.rmtree(entry / "images"), JSON, "none of which"),
-        (swap(JSON, b'"cx": 11.75, "cy": 8.5', b'"cx": 0.1175, "cy": 0.085'), "shares of the image size"),
-        (swap(JSON, b'"camera_angle_x": 1.0', b'"fl_x": 0.2, "fl_y": 0.2'), "shares of the image size"),
-        (key(JSON, "missing.png", "frames", 0, "mask_path"), "missing.png", "mask_path of transforms.json"),
+        (lambda entry: shutil.rmtree(entry / "images"), JSON, "none has its image"),
+        (swap(JSON, b'"cx": 11.75, "cy": 8.5', b'"cx": 0.1175, "cy": 0.085'), "give them in pixels"),
+        (key(JSON, "missing.png", "frames", 0, "mask_path"), "missing.png", "No such file"),
     ],
     "nerfstudio/deep": [
-        (key(JSON, 0.0, "applied_scale"), "cannot be inverted"), (key(JSON, "gone.ply", "ply_file_path"), "gone.ply"),
+        (key(JSON, 0.0, "applied_scale"), "scale of its world"), (key(JSON, "gone.ply", "ply_file_path"), "gone.ply"),
         (put("depth/depth1.png", np.ones((24, 16), np.uint16)), "depth1.png", "16x24"),
-        (put("depth/depth1.png", None), "depth1.png", "no such file"),
+        (put("depth/depth1.png", None), "depth1.png", "No such file"),
     ],
     "rgbd/scannet": [
         (put("pose/3.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n"), "not rigid"),
@@ -133,11 +132,11 @@ DAMAGE = {
     ],
     "rgbd/tum": [
         (put("groundtruth.txt", "1305031102.17 0 0 0 0 0 0 0\n"), "zero norm"),
-        (put("intrinsics.txt", "500 500 12 8" + 9 * " 0.01"), "9 numbers after"),
+        (put("intrinsics.txt", "500 500 12 8" + 9 * " 0.01"), "distortion"),
         (put("intrinsics.txt", None), "intrinsics.txt", "fx fy cx cy"),
     ],
     "rgbd/arkitscenes": [(put("lowres_wide.traj", "1 2 3\n"), "lowres_wide.traj")],
-    "rgbd/polycam": [(put("keyframes/corrected_cameras/101.json", '{"fx": 3}'), "'cx'")],
+    "rgbd/polycam": [(put("keyframes/corrected_cameras/101.json", '{"fx": 3}'), "'fy'")],
     "rgbd/record3d": [(put("metadata.json", '{"poses": [[0, 0, 0]]}'), "metadata.json")],
     "ply/9.ply": [
         (put("", POINTER), "git lfs pull"), (columns(opacity=None), "no opacity"), (columns(x=None), "no x"),
@@ -157,7 +156,7 @@ DAMAGE = {
     "clouds/a.laz": [(edit("", lambda data: data[:-9] + b"\xff" * 4 + data[-5:]), "claims 4294967295 records")],
     "splats/c.ply": [
         (swap("", b"element chunk 2", b"element chunk 1"), "damaged"),
-        (swap("", b"float min_scale_x", b"float odd_scale_x"), "SuperSplat 2", "splat-transform"),
+        (swap("", b"float min_scale_x", b"float odd_scale_x"), "SuperSplat 2"),
         (swap("", b"float min_r", b"float odd_r"), "SuperSplat 2"),
         (swap("", b"element sh 300", b"element sh 299"), "299 rows of harmonics for 300 Gaussians"),
     ],
@@ -180,11 +179,10 @@ DAMAGE = {
         (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "transparency"),
         (put("a.png", np.dstack([IDS.astype(np.uint16)] * 3)), "16 bits"),
     ],
-    "masks/levels": [
+    "proposals/levels": [
         (put("a_s.npy", np.zeros((3, *MASK_SIZE))), "a_s.npy", "shape is (3, 24, 36)"),
-        (put("a_s.npy", np.full((4, *MASK_SIZE), 0.5)), "a_s.npy", "no integers"),
+        (put("a_s.npy", np.full((4, *MASK_SIZE), 0.5)), "a_s.npy", "no whole numbers"),
         (edit("a_s.npy", lambda data: data[:300]), "a_s.npy", "cannot be read"),
-        (put("a.png", IDS), "there are both"),
     ],
     "masks/objects": [(put("001/a.png", IDS), "a.png", "3 values")],
     "proposals/sam": [
@@ -197,7 +195,7 @@ DAMAGE = {
     ],
     "labels/lerf": [
         (emptied, "no .json file"),
-        (key(LABEL, [], *OUTLINE), LABEL, "segmentation is empty"), (key(LABEL, [[1, 2, 3]], *OUTLINE), "object 0"),
+        (key(LABEL, [], *OUTLINE), LABEL, "of 0 corners"), (key(LABEL, [[1, 2, 3]], *OUTLINE), "object 0"),
         (key(LABEL, [[1, np.nan], [2, 3], [4, 5]], *OUTLINE), LABEL, "out of all range"),
         (key(LABEL, [1, 2, 3], "objects", 0, "bbox"), LABEL, "object 0"), (key(LABEL, "mug", "objects", 0), "object 0"),
         (key(LABEL, 7, "objects", 0, "category"), "category is 7"), (key(LABEL, "wide", "info", "width"), "wide"),

@@ -28,14 +28,14 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(tmp_path):
     frames = (np.ascontiguousarray(wide[:, 2 * n : 2 * n + 128]) for n in range(30))
     blurred = (frame if n in SHARP else cv2.GaussianBlur(frame, (0, 0), 2.5) for n, frame in enumerate(frames))
     video = written(tmp_path / "walk.avi", "MJPG", blurred)
-    found, notes = write_frames(video, tmp_path / "frames", frames=6, progress=lambda *at: told.append(at))
+    found, notes = write_frames(video, tmp_path / "frames", 6, lambda *at: told.append(at))
     assert notes == ()
     assert [path.name for path in found] == [f"frame_{number:06d}.jpg" for number in SHARP]
     assert sorted((tmp_path / "frames").iterdir()) == found
     assert cv2.imread(str(found[0])).shape == (96, 128, 3)
     assert told[-1] == (60, 60)
     assert sorted(told) == told
-    assert len(write_frames(video, tmp_path / "all")[0]) == 30  # a short one gives each of its frames
+    assert len(write_frames(video, tmp_path / "all", 150)[0]) == 30  # a short one gives each of its frames
 
 
 def moving(path, code, count=30):
@@ -47,12 +47,12 @@ def moving(path, code, count=30):
 @pytest.mark.parametrize(("name", "code"), [("a.mp4", "mp4v"), ("b.avi", "MJPG"), ("c.avi", "XVID")])
 def test_a_damaged_stretch_does_not_end_a_video(tmp_path, name, code):
     path = moving(tmp_path / name, code)
-    whole = len(write_frames(path, tmp_path / "whole")[0])
+    whole = len(write_frames(path, tmp_path / "whole", 150)[0])
     data = bytearray(path.read_bytes())
     start = len(data) // 2
     data[start : start + 3000] = bytes(3000)
     path.write_bytes(data)
-    found, notes = write_frames(path, tmp_path / "frames")
+    found, notes = write_frames(path, tmp_path / "frames", 150)
     assert 20 <= len(found) <= whole == 30
     assert found[-1].name >= "frame_000025.jpg"
     assert len(found) == 30 or f"{30 - len(found)} of 30 frames of {name} cannot be decoded" in notes[0]
@@ -62,7 +62,7 @@ def test_a_damaged_stretch_does_not_end_a_video(tmp_path, name, code):
 def test_a_video_that_is_cut_short_says_so(tmp_path, code):
     path = moving(tmp_path / "a.avi", code)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    found, notes = write_frames(path, tmp_path / "frames")
+    found, notes = write_frames(path, tmp_path / "frames", 150)
     assert 8 <= len(found) <= 22
     assert f"{30 - len(found)} of 30 frames" in notes[0]
     assert "cut short" in notes[0]
@@ -72,7 +72,7 @@ def test_a_video_that_is_cut_short_says_so(tmp_path, code):
 def test_a_name_may_have_colons(tmp_path, monkeypatch, name):
     moving(tmp_path / "a.avi", "MJPG", 4).rename(tmp_path / name)
     monkeypatch.chdir(tmp_path)
-    assert len(write_frames(Path(name), tmp_path / "frames")[0]) == 4
+    assert len(write_frames(Path(name), tmp_path / "frames", 150)[0]) == 4
 
 
 @pytest.mark.parametrize(("name", "mark"), [
@@ -80,6 +80,6 @@ def test_a_name_may_have_colons(tmp_path, monkeypatch, name):
 ])  # fmt: skip
 def test_high_dynamic_range_is_noted(tmp_path, name, mark):
     path = moving(tmp_path / name, "mp4v", 4)
-    assert write_frames(path, tmp_path / "frames")[1] == ()
+    assert write_frames(path, tmp_path / "frames", 150)[1] == ()
     path.write_bytes(path.read_bytes() + mark)
-    assert "HDR" in write_frames(path, tmp_path / "frames")[1][-1]
+    assert "HDR" in write_frames(path, tmp_path / "frames", 150)[1][-1]

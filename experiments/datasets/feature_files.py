@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, map_npy, reading, write_text
-from jsecon.read.masks.masks import LEVELS, _compact_ids, _read_level, resize_nearest
+from jsecon.read.masks.masks import LEVELS, compact_ids, resize_nearest
 from jsecon.vision.protocols import CANONICAL
 
 
@@ -46,8 +46,8 @@ def load_features(folder: Path, names: Sequence[str], size: tuple[int, int], *, 
         path, file = (folder / f"{name}_{kind}.npy" for kind in "sf")
         if not path.is_file():
             raise InputError(path, "there is no such file", remedy=remedy)
-        ids = _read_level(path, size, level)
-        kept, index = _compact_ids(path, ids if ids.shape == size else resize_nearest(ids, size[1], size[0]))
+        ids = map_npy(path)[LEVELS.index(level)].astype(np.int64)
+        kept, index = compact_ids(path, ids if ids.shape == size else resize_nearest(ids, size[1], size[0]))
         with reading(file, "a row for each id of the _s.npy beside it", remedy):
             table = map_npy(file)[kept]
         labels[t] = np.where(index >= 0, index + sum(map(len, rows)), -1)

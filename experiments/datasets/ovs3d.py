@@ -79,7 +79,7 @@ def load_segmentations(folder: Path, names: Sequence[str]) -> tuple[list[Labelle
             problem = f"classes without a mask: {without}; masks of no class: {beyond}"
             remedy = "Name each mask like its class; a class that a frame does not show has an all-black one."
             raise InputError(place, problem, remedy=remedy)
-        objects = {name: read_image(place / f"{name}.png")[0][..., 0] >= ON for name in classes}
+        objects = {name: read_image(place / f"{name}.png")[..., 0] >= ON for name in classes}
         shapes = {mask.shape for mask in objects.values()}
         if len(shapes) > 1:
             raise InputError(place, f"masks of {len(shapes)} sizes", "one size", "Export the masks again.")

@@ -23,7 +23,7 @@ from jsecon.app.catalogue import Catalogue, objects
 from jsecon.app.comparison import Changes, add_new_things, apply_changes, find_changes, splat_capture
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field
-from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows, world_record
+from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
 from jsecon.change.history import change_question, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
@@ -753,7 +753,7 @@ class Scene:
             near = nearest_gaussians(load_point_cloud(cloud).points, placed)
             rows = np.arange(len(near)) if mask is None else np.flatnonzero(np.append(mask, False)[near])
             ids = {name: np.append(column, np.int32(-1))[near[rows]] for name, column in ids.items()}
-            return save_point_cloud(Path(file), cloud, rows, ids, world_record(field).get("crs", ""))
+            return save_point_cloud(Path(file), cloud, rows, ids)
         if mask is not None:
             rows = np.flatnonzero(mask)
             gaussians, ids = gaussian_rows(gaussians, rows), {name: column[rows] for name, column in ids.items()}

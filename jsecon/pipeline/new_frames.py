@@ -132,7 +132,7 @@ def _place(
     side, frames = max(cameras.width, cameras.height), {}
     for done, (name, file) in enumerate(files.items()):
         try:
-            photo, _ = read_image(file)
+            photo = read_image(file)
         except InputError as error:
             refuse(error)
             continue

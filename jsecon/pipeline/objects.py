@@ -174,7 +174,7 @@ def _read_masks(stage: StageInput) -> StageResult:
     frames, _ = _frames_of_vision(stage)
     folder, view = stage.context.options.masks, _TrainingView(stage.results.load, stage.context.options, frames)
     assert folder is not None
-    loaded = load_labels(folder, view.names, view.size, **view.mask_layout, progress=stage.progress)
+    loaded = load_labels(folder, view.names, view.size, frames=view.mask_layout["frames"], progress=stage.progress)
     _clear_ignored(loaded.labels, view)
     _require_regions(loaded.labels, str(folder))
     notes = (f"{len(loaded.ids)} regions in the masks", *loaded.notes)

@@ -46,7 +46,7 @@ from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.captures.images import encode_jpeg
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import load_proposals
 from jsecon.read.splats.points import load_point_cloud
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
 from jsecon.views.frame import field_up
@@ -392,10 +392,9 @@ def _check_inputs(context: RunContext, plan: _RunState) -> None:
     train = training_frames(held_out)
     names = [list(frames)[t] for t in train[evenly_spaced(len(train), options.vision_frames)]]
     size, layout = (height, width), {"level": options.level, "frames": frames}
-    if options.masks is not None and "objects" in running:
-        load_labels(options.masks, names, size, **layout, limit=1)
-    if options.proposals is not None and "objects" in running:
-        load_proposals(options.proposals, names, size, **layout)[0](0)
+    for masks in (options.masks, options.proposals):
+        if masks is not None and "objects" in running:
+            load_proposals(masks, names, size, **layout)[0](0)
 
 
 def fit(options: Options, out: Path, *, console: Console | None = None) -> tuple[Gaussians, Capture, Quality]:

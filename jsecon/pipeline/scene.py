@@ -29,7 +29,6 @@ from jsecon.read.captures.frames import (
     PosedImages,
     evenly_spaced,
     frame_names,
-    make_rigid,
     transform_poses,
     usable_images,
 )
@@ -173,7 +172,7 @@ def _estimate_poses(stage: StageInput) -> StageResult:
     video, declared = is_video(capture), context.options.panoramas
     if video:
         frames, declared = _frames_of_video(context.options)
-        photos, found = write_frames(capture, folder / "frames", frames=frames, progress=stage.progress)
+        photos, found = write_frames(capture, folder / "frames", frames, stage.progress)
     else:
         photos, found = unposed_photographs(capture)
     panoramas, hints = find_panoramas(photos, declared=declared)
@@ -441,7 +440,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[PosedImages, Camera, tuple[
     width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
     sized = [lens.resized(width, height) for lens in lenses]
     fx, fy, cx, cy = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32).T
-    poses = np.stack([make_rigid(image.world_to_camera, path, image.name) for image in images])
+    poses = np.stack([image.world_to_camera for image in images])
     names = frame_names([image.name for image in images], path)
     return posed, Camera(poses, fx, fy, cx, cy, width, height), names
 

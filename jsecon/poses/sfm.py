@@ -166,7 +166,7 @@ def _link(photo: Path, link: Path, *, upright_copy: bool = False) -> None:
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)
     if upright_copy:
-        write_image(link, read_image(photo)[0])
+        write_image(link, read_image(photo))
         return
     try:
         link.symlink_to(photo.resolve())

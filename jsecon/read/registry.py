@@ -47,15 +47,14 @@ def _added_readers(group: str, path: tuple[str, ...]) -> tuple[Reader, ...]:
     """The readers of packages on a search path, whose listing takes some 10 ms."""
     added = []
     for entry in importlib.metadata.entry_points(group=group):
-        where, remedy = f"{group}:{entry.name}", "Update or uninstall the package that registers it."
         try:
             reader = entry.load()
+            if not isinstance(reader, Reader):
+                raise ValueError(f"it is a {type(reader).__name__}")
         except Exception as error:  # whatever a foreign package raises when it is imported
             problem = f"the reader {entry.value} of another package cannot be loaded ({describe_error(error)})"
-            raise InputError(where, problem, remedy=remedy) from error
-        if not isinstance(reader, Reader):
-            problem = f"{entry.value} is a {type(reader).__name__}"
-            raise InputError(where, problem, "a jsecon.read.registry.Reader", remedy)
+            remedy = "Update or uninstall the package that registers it."
+            raise InputError(f"{group}:{entry.name}", problem, remedy=remedy) from error
         added.append(reader)
     return tuple(added)
 
@@ -68,11 +67,9 @@ def decoding(path: Path, name: str) -> Iterator[Any]:
     try:
         with np.errstate(invalid="ignore", over="ignore"):
             yield importlib.import_module(name)
-    except InputError:
-        raise
     except ImportError as error:
         problem = f"a {path.suffix.lower()} like this needs the package {error.name or name}, which is not installed"
-        raise InputError(path, problem, remedy="Run: pip install 'jsecon[formats]' (or use a plain .ply).") from error
+        raise InputError(path, problem, remedy="Run: pip install 'jsecon[formats]'") from error
     except Exception as error:
         problem = f"the file is damaged or cut short ({describe_error(error).replace(f': {path}', '')})"
-        raise InputError(path, problem, remedy="Export it again, or as an uncompressed .ply.") from error
+        raise InputError(path, problem, remedy="Export it again.") from error

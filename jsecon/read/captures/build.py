@@ -30,12 +30,11 @@ from jsecon.read.captures.frames import (
     PosedImages,
     evenly_spaced,
     frame_names,
-    make_rigid,
     same_aspect,
     transform_poses,
     usable_images,
 )
-from jsecon.read.captures.images import apply_orientation, image_header, read_depth, read_image
+from jsecon.read.captures.images import image_header, read_depth, read_image
 from jsecon.read.captures.lens import Lens, operator_mask, resample_depth, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
@@ -50,8 +49,6 @@ class _Frame(NamedTuple):
     name: str
     posed: PosedImage
     image: Path
-    pose: np.ndarray
-    """(4, 4) world-to-camera, exactly rigid."""
     lens: Lens
     """Lens of the pixels as they are read, at their size; until the header is read, as the capture has it."""
     orientation: int = 1
@@ -63,41 +60,26 @@ class _Frame(NamedTuple):
         return self.lens.width, self.lens.height
 
 
-def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> tuple[list[_Frame], list[str]]:
-    """Decides how the image of each frame is read, and returns notes.
+def _resolve_orientations(frames: Sequence[_Frame], posed: PosedImages) -> list[_Frame]:
+    """Decides how the image of each frame is read, by its header.
 
     A camera model belongs to the stored pixels or to the upright image: COLMAP ignores EXIF, other programs apply it.
     If only one of the two has the model's aspect, it is that one. If both have it (a square, or a turn by 180 degrees),
     the program decides (`PosedImages.ignores_exif`).
     """
-    result, stored, turned = [], [], []
+    result = []
     for frame in frames:
         header = image_header(frame.image)
         fits_stored, fits_upright = (same_aspect(frame.size, size) for size in (header.stored, header.upright))
         orientation = 1 if fits_stored and (posed.ignores_exif or not fits_upright) else header.orientation
-        if orientation != 1:
-            turned.append(frame.posed.name)
-        elif header.orientation != 1:
-            stored.append(frame.posed.name)
-        lens = _lens_at_size(frame, *(header.upright if orientation != 1 else header.stored))
+        size = header.upright if orientation != 1 else header.stored
+        if not same_aspect(frame.size, size):
+            remedy = "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them."
+            expected = f"{frame.lens.width}x{frame.lens.height} of its camera, or that aspect"
+            raise InputError(frame.image, f"the image is {size[0]}x{size[1]}", expected, remedy)
+        lens = frame.lens if size == frame.size else frame.lens.resized(*size)
         result.append(frame._replace(lens=lens, orientation=orientation))
-    notes = []
-    if stored:
-        ignored = f"{len(stored)} images have an EXIF orientation that their camera models leave out"
-        notes.append(f"{ignored} (the first: {stored[0]}); they are taken as they are stored.")
-    if turned:
-        notes.append(f"{len(turned)} images were turned upright by their EXIF orientation (the first: {turned[0]}).")
-    return result, notes
-
-
-def _lens_at_size(frame: _Frame, width: int, height: int) -> Lens:
-    """The lens of an image at the size that it is read at."""
-    lens = frame.lens
-    if not same_aspect(frame.size, (width, height)):
-        remedy = "Use the images that the poses were estimated on (mind their rotation), or a scaled copy of them."
-        expected = f"{lens.width}x{lens.height} of its camera, or that aspect"
-        raise InputError(frame.image, f"the image is {width}x{height}", expected, remedy)
-    return lens if (width, height) == frame.size else lens.resized(width, height)
+    return result
 
 
 def plan_frames(
@@ -108,7 +90,7 @@ def plan_frames(
     Of the images, only headers are read.
     """
     frames, _ = _in_order(posed)
-    frames, _ = _resolve_orientations(_choose(frames, options), posed)
+    frames = _resolve_orientations(_choose(frames, options), posed)
     for lens in {frame.lens for frame in frames}:
         undistorted_pinhole(lens, posed.where)
     files = {frame.name: _file(frame) for frame in frames}
@@ -130,16 +112,15 @@ def _choose(frames: Sequence[_Frame], options: FrameOptions) -> list[_Frame]:
 
 def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.ndarray, " t"], list[str]]:
     """Chooses held-out frames: by the options, by the capture's own split, or every eighth photograph's; adds notes."""
-    own, notes = np.array([bool(frame.posed.held_out) for frame in frames]), []
+    own = np.array([bool(frame.posed.held_out) for frame in frames])
     has_split = any(frame.posed.held_out is not None for frame in frames)
     if has_split and options.holdout is None:
         held_out = own
-        notes.append(f"{own.sum()} of {len(own)} frames are held out, those that the capture's own split sets aside.")
+        notes = [f"{own.sum()} of {len(own)} frames are held out, those that the capture's own split sets aside."]
     else:
         every = 8 if options.holdout is None else options.holdout  # as in Mip-NeRF 360 and INRIA's split
         held_out = _photographs(frames)[0] % every == 0 if every else np.zeros(len(frames), bool)
-    if has_split and options.holdout is not None:
-        notes.append(f"The capture's own split, {own.sum()} frames for testing, is not used: a holdout is given.")
+        notes = ["The capture's own split is not used: a holdout is given."] if has_split else []
     if held_out.all():
         held_out[:] = False
         notes.append("No frame was held out, since none would be left to fit to.")
@@ -158,15 +139,15 @@ def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
     missing = [image.name for image in placed if image.image is None]
     first = f"(the first: {missing[0]})" if missing else ""
     if not images:
-        problem = f"it has {len(missing)} frames, none of which has its image {first}" if missing else "it has no frame"
-        problem = f"{problem}; {notes[0]}" if notes else problem
-        remedy = "Copy the images to where it names them." if missing else "Estimate the poses again."
-        raise InputError(posed.where, problem, remedy=remedy)
+        problem = " ".join([f"of its {len(placed)} frames with a pose, none has its image {first}".strip(), *notes])
+        raise InputError(
+            posed.where, problem, remedy="Copy the images to where it names them, or estimate poses again."
+        )
     if missing:
         notes.append(f"{len(missing)} of {len(placed)} frames were left out: their images are missing {first}.")
     images.sort(key=lambda image: re.sub(r"\d+", lambda number: number[0].zfill(20), image.name))
     frames = [
-        _Frame(name, image, image.image, make_rigid(image.world_to_camera, posed.where, image.name), image.lens)
+        _Frame(name, image, image.image, image.lens)
         for name, image in zip(frame_names([image.name for image in images], posed.where), images)
         if image.image and image.lens
     ]
@@ -204,12 +185,10 @@ def _read_depth(
     lens, depth = frame.lens, read_depth(file, frame.posed.depth_unit * unit)
     if frame.posed.depth_lens is not None:
         depth = resample_depth(depth, frame.posed.depth_lens, lens)
-    elif frame.orientation > 4 and not same_aspect(frame.size, depth.shape[1::-1]):  # measured like the stored pixels
-        depth = apply_orientation(depth, frame.orientation)
-    if not same_aspect(frame.size, depth.shape[1::-1]):
-        problem = f"the depth map is {depth.shape[1]}x{depth.shape[0]}"
+    height, width = depth.shape
+    if not same_aspect(frame.size, (width, height)):
         expected = f"the aspect of its image, {lens.width}x{lens.height}"
-        raise InputError(file, problem, expected, "Register it to the image.")
+        raise InputError(file, f"the depth map is {width}x{height}", expected, "Register it to the image.")
     # Nearest throughout: the mean of two depths lies on neither surface.
     if maps is not None:
         depth = cv2.resize(depth, frame.size, interpolation=cv2.INTER_NEAREST_EXACT)
@@ -230,24 +209,16 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     if not known.all():
         notes.append(f"{int((~known).sum())} sparse points were left out: their coordinates are no ordinary numbers.")
         posed = dataclasses.replace(posed, points=posed.points[known], colours=posed.colours[known])
-    deep = [frame.posed for frame in frames if frame.posed.depth is not None and not len(posed.points)]
-    samples = [deep[index] for index in evenly_spaced(len(deep), 8)] if deep else []
-    depths = [read_depth(image.depth, image.depth_unit) for image in samples if image.depth is not None]
-    poses = np.stack([frame.pose for frame in frames])
-    world, world_notes = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
-    notes += [*posed.notes, *world_notes]
-    unsized = _choose(frames, options)
-    if len(unsized) < len(frames):
-        notes.append(f"{len(unsized)} of {len(frames)} frames were taken, evenly spaced.")
-    frames, orientation_notes = _resolve_orientations(unsized, posed)
-    notes += orientation_notes
-    if rescaled := sum(frame.size != before.size for frame, before in zip(frames, unsized)):
-        notes.append(f"{rescaled} images have another size than their camera model; its intrinsics were scaled.")
+    deep = [(frame.posed.depth, frame.posed.depth_unit) for frame in frames if not len(posed.points)]
+    deep = [(depth, unit) for depth, unit in deep if depth is not None]
+    depths = [read_depth(*deep[index]) for index in evenly_spaced(len(deep), 8)]
+    poses = np.stack([frame.posed.world_to_camera for frame in frames])
+    world = _normalizing_transform(poses, posed.points, depths)  # of all frames, whichever are taken
+    notes += posed.notes
+    frames = _resolve_orientations(_choose(frames, options), posed)
     if bent := sum(frame.lens.distorted and frame.lens.view is None for frame in frames):
         notes.append(f"{bent} images were undistorted; masks and labels must be of the undistorted images.")
     width, height = _commonest_size(frames)
-    if odd := sum(frame.lens.undistorted_size != (width, height) for frame in frames):
-        notes.append(f"{odd} images were resized to {width}x{height}, the commonest size, with their intrinsics.")
     width, height = options.size((width, height))
     files = tuple(map(_file, frames))
     frames = [_shrink_panorama(frame, width) for frame in frames]
@@ -262,10 +233,10 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
     ignored = scratch_array(pixels.shape[:3], bool) if has_ignored else None
     photographs, count = _photographs(frames)
 
-    def read(photograph: int) -> bool:
+    def read(photograph: int) -> None:
         rows = np.flatnonzero(photographs == photograph)
         first = frames[rows[0]]
-        image, is_transparent = read_image(first.image, upright=first.orientation != 1)
+        image = read_image(first.image, upright=first.orientation != 1)
         if image.shape[1::-1] != first.size:
             image = cv2.resize(image, first.size, interpolation=cv2.INTER_AREA)
         for t in rows:
@@ -275,30 +246,22 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
             if ignored is not None:
                 ignored[t] = operator_mask(lens, pinholes[lens].resized(width, height))
             if (mask := frames[t].posed.mask) is not None and ignored is not None:
-                kept, _ = read_image(mask, upright=first.orientation != 1)
+                kept = read_image(mask, upright=first.orientation != 1)
                 kept = cv2.resize(kept, first.size, interpolation=cv2.INTER_NEAREST_EXACT)
                 ignored[t] |= (_undistort(kept, lens, maps, (width, height)) < 128).all(axis=-1)
             if depth is not None and depth_maps is not None:
                 depth_maps[t] = _read_depth(depth, frames[t], maps, (width, height), world[0, 0])
-        return is_transparent
 
-    transparent = 0
     with ThreadPoolExecutor(cores()) as pool:
-        try:
-            for done, is_transparent in enumerate(pool.map(read, range(count)), start=1):
-                transparent += is_transparent
-                if progress is not None:
-                    progress(done, count)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    if transparent:
-        notes.append(f"{transparent} images have transparent pixels; they were laid over black.")
+        for done, _ in enumerate(pool.map(read, range(count)), start=1):  # cancels the others if one fails
+            if progress is not None:
+                progress(done, count)
     held_out, split_notes = _hold_out(frames, options)
     notes += split_notes
     final = [pinholes[frame.lens].resized(width, height) for frame in frames]
     fx, fy, cx, cy = np.array([(lens.fx, lens.fy, lens.cx, lens.cy) for lens in final], np.float32).T
-    poses, from_world = transform_poses(np.stack([frame.pose for frame in frames]), world), np.linalg.inv(world)
+    poses = transform_poses(np.stack([frame.posed.world_to_camera for frame in frames]), world)
+    from_world = np.linalg.inv(world)
     return Capture(
         frames=pixels,
         cameras=Camera(poses.astype(np.float32), fx, fy, cx, cy, width, height),
@@ -319,8 +282,8 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
 
 def _normalizing_transform(
     poses: Float[np.ndarray, "t 4 4"], points: Float[np.ndarray, "p 3"], depths: Sequence[np.ndarray] = ()
-) -> tuple[Float[np.ndarray, "4 4"], tuple[str, ...]]:
-    """Finds the similarity (shift and scale, no rotation) from a capture's world to one of ordinary numbers, and notes.
+) -> Float[np.ndarray, "4 4"]:
+    """Finds the similarity (shift and scale, no rotation) from a capture's world to one of ordinary numbers.
 
     That is near the origin, and of the size of metres; for most captures it is the identity. A scene that is moved, or
     scaled by a power of 1000, comes out in the same world up to a shift of its own size. Depth maps of a few views, in
@@ -332,19 +295,14 @@ def _normalizing_transform(
     near = _near_depth(poses, np.asarray(points, np.float64), depths) or spread
     if near < max(1e-6, 1e-12 * np.abs(middle).max()):  # rounding: the cameras stand in one place
         near = 1.0
-    origin, notes, size = np.zeros(3), [], max(near, spread)
+    origin, size = np.zeros(3), max(near, spread)
     if np.abs(middle).max() > 100 * size:
         step = 10.0 ** np.ceil(np.log10(size))
         origin = np.round(middle / step) * step
-        place = ", ".join(f"{number:.10g}" for number in origin)
-        notes.append(f"The coordinates are large. jsecon works relative to ({place}) and adds it to what it writes.")
     factor = _UNIT_STEP ** np.ceil(np.log(_MIN_DEPTH / near) / np.log(_UNIT_STEP) - 1e-9)
-    if factor != 1:
-        works = f"jsecon works at {factor:g} times the size and writes the units of the files."
-        notes.append(f"The units are far from metres: the near things are {near:.3g} away. {works}")
     result = np.diag([factor, factor, factor, 1.0])
     result[:3, 3] = -factor * origin
-    return result, tuple(notes)
+    return result
 
 
 def _near_depth(poses: np.ndarray, points: np.ndarray, depths: Sequence[np.ndarray]) -> float | None:

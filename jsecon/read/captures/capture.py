@@ -13,7 +13,7 @@ from pathlib import Path
 from PIL import Image
 
 from jsecon.errors import InputError, join_first
-from jsecon.files import describe_substitute, is_output_folder, list_files, reading
+from jsecon.files import is_output_folder, list_files, reading
 from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImages
@@ -78,9 +78,9 @@ def load_capture(
 def read_posed_images(path: Path) -> PosedImages:
     """Reads a capture without its pixels; its images need not be there."""
     reader = _find_reader(path)
-    if reader is None:
-        raise _no_capture(path)
     with reading(path, remedy="Export the capture again."):
+        if reader is None:
+            raise _no_capture(path)
         return cut_panoramas(reader.read(path))
 
 
@@ -94,10 +94,9 @@ def has_depth(path: Path) -> bool:
     reader = _find_reader(path)
     if reader is None or reader.name == "COLMAP":
         return False
-    try:
+    with contextlib.suppress(InputError):
         return any(image.depth is not None for image in read_posed_images(path).images)
-    except InputError:
-        return False
+    return False
 
 
 def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
@@ -112,9 +111,8 @@ def _sort_images(path: Path) -> tuple[list[Path], list[Path]]:
         return [], []
     images = sorted(file for file in folder.iterdir() if _is_image(file) and file.is_file())
     if not images:
-        inner = [file for file in list_files(folder) if _is_image(file)]
-        parts = {file: file.relative_to(folder).parts[:-1] for file in inner}
-        images = [file for file in inner if not any(_OTHER_IMAGES.search(part.lower()) for part in parts[file])]
+        inner = [(file, file.relative_to(folder).parent.as_posix()) for file in list_files(folder) if _is_image(file)]
+        images = [file for file, place in inner if not _OTHER_IMAGES.search(place.lower())]
     derived = _derived_images(images)
     photos = [file for file in images if file not in derived and _is_photograph(file)]
     return photos, sorted({*images}.difference(photos))
@@ -127,10 +125,9 @@ def _is_photograph(path: Path) -> bool:
     """
     if path.suffix.lower() not in (".png", ".tif", ".tiff", ".bmp"):
         return True
-    try:
+    with contextlib.suppress(InputError):
         return image_header(path).mode not in ("1", "I", "F", "I;16", "I;16B", "I;16L")
-    except InputError:
-        return True
+    return True
 
 
 def _derived_images(images: Sequence[Path]) -> set[Path]:
@@ -143,9 +140,7 @@ def _derived_images(images: Sequence[Path]) -> set[Path]:
     names = {*images}
     bases = {base(file) for file in images if not _OTHER_WORD.search(file.stem.lower())}
     derived = {file for file in images if _OTHER_WORD.search(file.stem.lower()) and base(file) in bases}
-    derived |= {file for file in images if file.with_suffix("") in names}
-    photographs = {file.with_suffix("") for file in images if file.suffix.lower() in (".jpg", ".jpeg")}
-    return derived.union(f for f in images if f.suffix.lower() == ".png" and f.with_suffix("") in photographs)
+    return derived.union(file for file in images if file.with_suffix("") in names)
 
 
 def _is_image(file: Path) -> bool:
@@ -165,8 +160,7 @@ def unposed_photographs(path: Path) -> tuple[list[Path], tuple[str, ...]]:
     if is_nested and _inner_captures(path):
         return [], ()
     if photos and (above := _capture_above(path)) is not None:
-        folder, name = above
-        raise InputError(path, f"its photographs are part of a {name} capture", remedy=f"Give that: {folder}")
+        raise InputError(path, f"its photographs are part of a {above[1]} capture", remedy=f"Give that: {above[0]}")
     return photos, _notes_beside(path, photos, others) if photos else ()
 
 
@@ -191,11 +185,8 @@ def _capture_above(path: Path) -> tuple[Path, str] | None:
     place = Path(os.path.abspath(path))
     for folder in place.parents[:3]:
         reader = _find_reader(folder)
-        if reader is not None:
-            try:
-                images = [image.image for image in read_posed_images(folder).images]
-            except InputError:  # then its photographs are no capture
-                continue
+        with contextlib.suppress(InputError):  # then its photographs are no capture
+            images = [image.image for image in read_posed_images(folder).images] if reader else []
             if any(image is not None and place in Path(os.path.abspath(image)).parents for image in images):
                 return folder, reader.name
     return None
@@ -206,18 +197,12 @@ def _notes_beside(path: Path, photos: Sequence[Path], others: Sequence[Path]) ->
     children = [*path.iterdir(), *(photos[0].parent.iterdir() if photos[0].parent != path else ())]
     poses = [child for child in children if _POSE.fullmatch(child.name.lower())]
     unread = [child for child in children if unread_remedy(child) or is_video(child)]
-    notes = []
-    if others:
-        left_out = "are left out as depth maps, masks or copies of the photographs"
-        notes.append(f"{len(others)} images {left_out} ({join_first([file.name for file in others])}).")
-    if poses:
-        names = join_first(sorted(file.name for file in poses))
-        remedy = "Write them as a COLMAP model or a transforms.json to use them."
-        notes.append(f"What may be poses is of a layout that jsecon does not read ({names}). {remedy}")
-    if unread:
-        names = join_first(sorted(file.name for file in unread))
-        notes.append(f"Files of formats that are not read here are left out ({names}). Give a video by itself.")
-    return tuple(notes)
+    rows = (
+        (others, "{} images are left out as depth maps, masks or copies of the photographs ({})."),
+        (poses, "{} files may be poses in a layout that is not read ({}): write a COLMAP model or a transforms.json."),
+        (unread, "{} files of formats that are not read here are left out ({}). Give a video by itself."),
+    )
+    return tuple(text.format(len(files), join_first(sorted(f.name for f in files))) for files, text in rows if files)
 
 
 def _inner_captures(path: Path) -> list[Path]:
@@ -229,40 +214,23 @@ def _inner_captures(path: Path) -> list[Path]:
 def _no_capture(path: Path) -> InputError:
     """The error of a path without a capture: what lies there, and what to give instead."""
     expected = "a capture of COLMAP, nerfstudio, a depth camera or a phone; or photographs, or a video"
-    entries = sorted(child for child in path.iterdir() if not child.name.startswith(".")) if path.is_dir() else []
-    images = [*entries, *path.glob("images/*")] if path.is_dir() else []
+    if not path.is_dir():
+        problem = f"a file with the suffix {path.suffix!r} is not a capture"
+        problem = problem if path.exists() else "there is no such file or folder"
+        return InputError(path, problem, expected, "Give the folder of the capture, its transforms file, or the video.")
+    entries = sorted(child for child in path.iterdir() if not child.name.startswith("."))
     problem = f"a folder without poses and photographs, but with {join_first([child.name for child in entries])}"
     remedy = "Give a folder with images/ and sparse/0, with transforms.json, or with photographs in it."
-    scenes = [child for child in entries if child.suffix.lower() in SCENES[:-1]]
-    scenes = sorted(path.glob("point_cloud/*/*.ply"), key=lambda file: file.stat().st_mtime) or scenes  # INRIA's
-    if not path.exists():
-        problem, remedy = "there is no such file or folder", "Check the path."
-    elif _is_archive(path):
-        problem, remedy = "an archive", f"Unpack it and give the folder: unzip {path.name} -d {path.stem}"
-    elif unread_remedy(path) or _is_image(path):
-        problem, remedy = "one image", "Give the folder of the photographs, in JPEG or PNG."
-    elif not path.is_dir():
-        problem = f"a file with the suffix {path.suffix!r} is not a capture"
-        remedy = "Give the folder of the capture, its transforms file (.json), or the video."
+    scenes = [*path.glob("point_cloud/*/*.ply"), *(child for child in entries if child.suffix.lower() in SCENES[:-1])]
+    if not entries:
+        problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif photos := unposed_photographs(path)[0]:
         problem, expected = f"{len(photos)} photographs without poses", "a capture with poses"
         remedy = "Find their poses first: jsecon run does so (extra sfm), and keeps them in OUT/cache as a capture."
-    elif not entries:
-        problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif captures := _inner_captures(path):
         remedy = f"Give the capture's own folder, for example {captures[0]}."
-    elif unread := list(filter(unread_remedy, images)):
+    elif unread := list(filter(unread_remedy, [*entries, *path.glob("images/*")])):
         problem, remedy = f"{len(unread)} {unread[0].suffix} images, which are not read", unread_remedy(unread[0])
-    elif others := _sort_images(path)[1]:
-        names = join_first([file.name for file in others])
-        problem = f"{len(others)} depth maps or masks ({names}), but no photographs"
-    elif videos := list(filter(is_video, entries)):
-        remedy = f"Give one video: jsecon run {videos[0]}"
-    elif scenes:
-        remedy = f"Give the scene: jsecon run {scenes[-1]}"
+    elif given := [*filter(is_video, entries), *scenes]:
+        remedy = f"Give the video or the scene: jsecon run {given[0]}"
     return InputError(path, problem, expected, remedy)
-
-
-def _is_archive(path: Path) -> bool:
-    """Whether a file is a compressed archive, such as a .zip or a .r3d."""
-    return "archive" in (describe_substitute(path, in_place=False) or ("",))[0]

@@ -22,37 +22,29 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import InputError
 from jsecon.files import path_within, read_lines, reading
 from jsecon.numerics import is_finite_and_bounded
-from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.frames import PosedImage, PosedImages, pose_matrix
 from jsecon.read.captures.images import find_image
 from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
 
 _MARK = "cameras.[bt][ix][nt]"
 """cameras.bin or cameras.txt, which every model has"""
-_PARAMETERS = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12,
-    "FOV": 0,
-    "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5,
-    "THIN_PRISM_FISHEYE": 0,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 0,
-    "SIMPLE_DIVISION": 0,
-    "DIVISION": 0,
-    "SIMPLE_FISHEYE": 3,
-    "FISHEYE": 4,
-    "EUCM": 0,
-    PANORAMA: 2,
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    17: (PANORAMA, 2),
 }
-"""camera models in the order of their numbers in binary files, from 0 on -> number of parameters; 0: not read, as
-OpenCV does not have them"""
+"""camera models by their numbers in binary files: names and numbers of parameters; OpenCV does not have the others"""
 _REMEDY = "Copy the model again, or export it anew with colmap model_converter."
-_UNDISTORT = "Run colmap image_undistorter and load its output."
 
 
 def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
@@ -62,14 +54,15 @@ def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
     """
     found = {file.parent for place in places for file in path.glob(place + _MARK)}
     found = sorted(found, key=lambda model: (not model.name.isdecimal(), len(model.name), model))
-    found = [model for model in found if _model_file(model, "images")] or found
-    models, notes = {model: _read_images(model) for model in found}, []
+    found = [model for model in found if _model_file(model, "images").is_file()] or found
+    models, notes = {model: _read_images(_model_file(model, "images")) for model in found}, []
     model, *others = sorted(models, key=lambda model: -len(models[model]))
     if others:
-        largest, *rest = (f"{place.relative_to(path)} with {len(models[place])} images" for place in (model, *others))
-        used = f"There are {len(models)} models. The largest, {largest}, is used; left out: {', '.join(rest)}."
-        notes.append(f"{used} Join them (colmap model_merger), or take photographs between them, to use all.")
-    lenses, images = _read_cameras(model), models[model]
+        largest = f"{model.relative_to(path)} with {len(models[model])} images"
+        notes.append(
+            f"Of {len(models)} models the largest, {largest}, is used. Join them (colmap model_merger) to use all."
+        )
+    lenses, images = _read_cameras(_model_file(model, "cameras")), models[model]
     above = (path.parent / "images", path.parent.parent / "images") if model == path else ()
     files = _find_images(path, [name for name, _, _ in images], above)
     split = model / "test.txt"  # the split of INRIA's training: names of images
@@ -80,23 +73,14 @@ def _read_colmap(places: Sequence[str], path: Path) -> PosedImages:
             raise InputError(model, f"image {name} has camera {camera}, which the cameras file lacks", remedy=_REMEDY)
         held_out = None if tested is None else name in tested
         posed.append(PosedImage(name, files.get(name), lenses[camera], pose, held_out=held_out))
-    if _model_file(model, "points3D") is None:
-        notes.append("The model has no points3D file: there are no sparse points.")
-        return PosedImages(posed, model, notes=tuple(notes), ignores_exif=True)
-    return PosedImages(posed, model, *_read_points(model), notes=tuple(notes), ignores_exif=True)
+    points = _read_points(file) if (file := _model_file(model, "points3D")).is_file() else ()
+    return PosedImages(posed, model, *points, notes=tuple(notes), ignores_exif=True)
 
 
-def _model_file(model: Path, kind: str) -> Path | None:
-    """The binary or text file of a kind, or None."""
-    return next((file for end in (".bin", ".txt") if (file := model / (kind + end)).is_file()), None)
-
-
-def _require_file(model: Path, kind: str) -> Path:
-    """The binary or text file of a kind."""
-    file = _model_file(model, kind)
-    if file is None:
-        raise InputError(model, f"it has no {kind}.bin or {kind}.txt", remedy=_REMEDY)
-    return file
+def _model_file(model: Path, kind: str) -> Path:
+    """The binary file of a kind, or else the text file, which may be missing."""
+    binary = model / f"{kind}.bin"
+    return binary if binary.is_file() else binary.with_suffix(".txt")
 
 
 def _find_images(path: Path, names: Sequence[str], more: Sequence[Path]) -> dict[str, Path]:
@@ -127,24 +111,19 @@ def _parse_lines(file: Path, layout: str, parse: Callable[[str], Any]) -> list:
     A ValueError of `parse` becomes an error with the line's number and the `layout` that it should have.
     """
     records = []
-    for number, line in enumerate(map(str.strip, read_lines(file)), start=1):
-        if line and not line.startswith("#"):
-            try:
-                records.append(parse(line))
-            except InputError:
-                raise
-            except ValueError as error:
-                raise InputError(file, f"line {number} is {line[:80]!r}", layout, _REMEDY) from error
+    with reading(file, layout, _REMEDY):
+        for number, line in enumerate(map(str.strip, read_lines(file)), start=1):
+            if line and not line.startswith("#"):
+                with reading(file, layout, _REMEDY, problem=f"line {number} is {line[:80]!r}"):
+                    records.append(parse(line))
     return [record for record in records if record is not None]
 
 
 def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[float, ...]) -> Lens:
     """The lens of a camera of a model file."""
-    if not _PARAMETERS.get(model):
-        known = ", ".join(name for name, count in _PARAMETERS.items() if count)
-        raise InputError(file, f"the camera model {model} is not read", f"one of {known}", _UNDISTORT)
-    if len(parameters) != _PARAMETERS[model]:
-        raise InputError(file, f"a {model} camera has {len(parameters)} parameters", str(_PARAMETERS[model]), _REMEDY)
+    if (model, len(parameters)) not in _MODELS.values():
+        problem = f"the camera model {model} with {len(parameters)} parameters is not read"
+        raise InputError(file, problem, remedy="Run colmap image_undistorter and load its output.")
     if model == PANORAMA:
         return panorama_lens(file, width, height)
     focals = 1 if model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE") else 2
@@ -154,9 +133,8 @@ def _lens(file: Path, model: str, width: int, height: int, parameters: tuple[flo
         return Lens(width, height, fx, fy, cx, cy, tuple(distortion), "FISHEYE" in model)
 
 
-def _read_cameras(model: Path) -> dict[int, Lens]:
+def _read_cameras(file: Path) -> dict[int, Lens]:
     """The lenses of a model by camera number."""
-    file = _require_file(model, "cameras")
 
     def parse(line: str) -> tuple[int, Lens]:
         number, name, width, height, *parameters = line.split()
@@ -164,16 +142,13 @@ def _read_cameras(model: Path) -> dict[int, Lens]:
 
     if file.suffix == ".txt":
         return dict(_parse_lines(file, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS", parse))
-    lenses, names = {}, list(_PARAMETERS)
+    lenses = {}
     with _reading(file):
         stream = io.BytesIO(file.read_bytes())
         for _ in range(*_take(stream, "Q")):
             camera, number, width, height = _take(stream, "iiQQ")
-            if not 0 <= number < len(names):
-                expected = f"one of 0 to {len(names) - 1} (COLMAP 4.2)"
-                raise InputError(file, f"the unknown camera model number {number}", expected, _UNDISTORT)
-            parameters = _take(stream, f"{_PARAMETERS[names[number]]}d")
-            lenses[camera] = _lens(file, names[number], width, height, parameters)
+            model, count = _MODELS.get(number, (f"number {number}", 0))
+            lenses[camera] = _lens(file, model, width, height, _take(stream, f"{count}d"))
     return lenses
 
 
@@ -182,15 +157,11 @@ def _pose(numbers: tuple[float, ...]) -> np.ndarray:
     quaternion = np.array(numbers[:4], np.float64)
     if not is_finite_and_bounded(numbers) or not np.linalg.norm(quaternion) > 1e-6:
         return np.full((4, 4), np.nan)
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
-    pose[:3, 3] = numbers[4:7]
-    return pose
+    return pose_matrix(Rotation.from_quat(np.roll(quaternion, -1)), numbers[4:7])
 
 
-def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
+def _read_images(file: Path) -> list[tuple[str, int, np.ndarray]]:
     """(name, camera number, (4, 4) float64 world-to-camera) of each image of a model, in the order of the file."""
-    file = _require_file(model, "images")
 
     def parse(line: str) -> tuple[str, int, np.ndarray] | None:
         numeric = not line.strip("0123456789+-.eEnaifNAIF \t")  # with nan and inf
@@ -216,25 +187,16 @@ def _read_images(model: Path) -> list[tuple[str, int, np.ndarray]]:
     return images
 
 
-def _read_points(model: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
+def _read_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
     """The sparse points of a model, float64, and their colours."""
-    file = _require_file(model, "points3D")
-    if file.suffix == ".txt":
-        rows = _parse_lines(file, "POINT3D_ID X Y Z R G B ERROR TRACK", _parse_point)
-        table = np.array(rows, np.float64).reshape(-1, 6)
-        points, colours = table[:, :3], table[:, 3:].astype(np.uint8)
-    else:
-        points, colours = _read_binary_points(file)
-    return points, colours
-
-
-def _parse_point(line: str) -> tuple[float, float, float, int, int, int]:
-    """Position and colour of a line of points3D.txt."""
-    _, x, y, z, red, green, blue, _ = line.split(maxsplit=8)[:8]
-    colour = int(red), int(green), int(blue)
-    if not all(0 <= value <= 255 for value in colour):
-        raise ValueError("not a colour")
-    return float(x), float(y), float(z), *colour
+    if file.suffix == ".bin":
+        return _read_binary_points(file)
+    with reading(file, "POINT3D_ID X Y Z R G B ERROR TRACK", _REMEDY):
+        rows = [line for line in read_lines(file) if line.strip() and not line.startswith("#")]
+        table = np.loadtxt(rows, usecols=range(1, 7), ndmin=2) if rows else np.zeros((0, 6))
+        if not ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all():
+            raise ValueError("its colours are not from 0 to 255")
+    return table[:, :3], table[:, 3:].astype(np.uint8)
 
 
 def _read_binary_points(file: Path) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
@@ -83,8 +84,7 @@ class FrameOptions:
             if value is not None and not 1 <= value < np.inf:
                 raise InputError(name, str(value), "a number of at least 1", "Leave it out for no limit.")
         if self.holdout is not None and (self.holdout < 0 or self.holdout == 1):
-            remedy = "8 is the custom; 1 leaves no frame to fit to."
-            raise InputError("holdout", str(self.holdout), "0 (no frame), or at least 2 (every second)", remedy)
+            raise InputError("holdout", str(self.holdout), "0 (no frame), or at least 2", "8 is the custom.")
 
     def size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Computes (width, height) of the frames of images of a size, px."""
@@ -119,17 +119,18 @@ def frame_names(files: Sequence[str], where: object) -> tuple[str, ...]:
             return tuple(names)
     twice = collections.Counter(names).most_common(1)[0][0]
     first, second = [file for file, name in zip(files, names) if name == twice][:2]
-    remedy = "Rename the images, or take one of the two out."
-    raise InputError(where, f"two frames, {first} and {second}, differ in their suffixes only", remedy=remedy)
+    raise InputError(where, f"two frames, {first} and {second}, differ in their suffixes only", remedy="Rename one.")
 
 
 def usable_images(posed: PosedImages) -> tuple[list[PosedImage], list[str]]:
-    """Chooses the images of a capture with a pose of ordinary numbers, each once, and says what was left out."""
+    """Chooses the images of a capture that have a pose, each once, with exactly rigid poses; says what was left out."""
     placed = [image for image in posed.images if _is_known(image.world_to_camera)]
     once = list({image.name: image for image in reversed(placed)}.values())[::-1]
-    lost, twice = len(posed.images) - len(placed), len(placed) - len(once)
-    notes = [f"{lost} frames were left out: their poses are 0, NaN, infinite or absurd numbers."] if lost else []
-    return once, [*notes, f"{twice} frames are listed twice; the first of each was taken."] if twice else notes
+    count, lost, twice = len(posed.images), len(posed.images) - len(placed), len(placed) - len(once)
+    notes = [f"{lost} of {count} frames were left out: they have no pose, or one of absurd numbers."] if lost else []
+    notes += [f"{twice} frames are listed twice; the first of each was taken."] if twice else []
+    rigid = [make_rigid(image.world_to_camera, posed.where, image.name) for image in once]
+    return [dataclasses.replace(image, world_to_camera=pose) for image, pose in zip(once, rigid)], notes
 
 
 def _is_known(pose: np.ndarray) -> bool:
@@ -148,14 +149,20 @@ def make_rigid(pose: Float[np.ndarray, "4 4"], where: object, name: str) -> Floa
         return np.full((4, 4), np.nan)
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if error > 1e-3 or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
-        measured = f"R R^T is off by {error:.2g}, determinant {np.linalg.det(rotation):.3g}"
         expected = "a rotation and a translation, without scale, shear or mirror"
         remedy = "Estimate the poses again, or take this frame out of the capture."
-        raise InputError(where, f"the pose of {name} is not rigid ({measured})", expected, remedy)
+        raise InputError(where, f"the pose of {name} is not rigid (R R^T is off by {error:.2g})", expected, remedy)
     left, _, right = np.linalg.svd(rotation)
     result = pose.copy()
     result[:3, :3] = left @ right
     return result
+
+
+def pose_matrix(rotation: Rotation, translation: Sequence[float] | np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """Makes the (4, 4) matrix of a rotation and a translation."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), translation
+    return pose
 
 
 def transform_poses(

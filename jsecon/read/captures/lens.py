@@ -59,12 +59,11 @@ class Lens:
         """Raises ValueError if no image can have been taken with it."""
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         has_size = 0 < self.width < 1 << 31 and 0 < self.height < 1 << 31
-        if not (has_size and is_finite_and_bounded(numbers) and min(self.fx, self.fy) >= 1e-3):
-            size = f"{self.width}x{self.height}"
-            raise ValueError(f"a camera of {size} px has focal lengths, centre and distortion {numbers}")
-        if max(self.cx, self.cy) <= 1 and min(self.width, self.height) >= 8:
-            size = f"{self.width}x{self.height}"
-            raise ValueError(f"a camera of {size} px has its centre at {self.cx:g}, {self.cy:g}: give it in pixels")
+        is_lens = is_finite_and_bounded(numbers) and min(self.fx, self.fy) >= 1e-3 and len(self.distortion) <= 8
+        is_in_pixels = max(self.cx, self.cy) > 1 or min(self.width, self.height) < 8
+        if not (has_size and is_lens and is_in_pixels):
+            problem = f"a camera of {self.width}x{self.height} px has focal lengths, centre and distortion {numbers}"
+            raise ValueError(problem if is_in_pixels else f"{problem}: give them in pixels")
 
     @property
     def distorted(self) -> bool:
@@ -88,8 +87,7 @@ class Lens:
 def panorama_lens(where: object, width: int, height: int) -> Lens:
     """Makes the lens of a panorama; `where` names its file in the error of another aspect than 2:1."""
     if width != 2 * height:
-        remedy = "Export the whole sphere, or give it as a photograph."
-        raise InputError(where, f"the panorama is {width}x{height}", "twice as wide as high", remedy)
+        raise InputError(where, f"the panorama is {width}x{height}", "twice as wide as high", "Export all directions.")
     return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, panorama=True)
 
 

@@ -9,18 +9,16 @@ _scale).
 """
 
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
-from jsecon.read.captures.images import IMAGE_SUFFIXES, find_image, size_around
+from jsecon.read.captures.images import find_image, image_header, without_image_suffix
 from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
 from jsecon.read.splats.points import load_point_cloud
@@ -64,12 +62,11 @@ def _read_nerfstudio(path: Path) -> PosedImages:
                 # From OpenGL's axes of the camera to OpenCV's.
                 pose = make_rigid(_matrix(entry["transform_matrix"]) * [1, -1, -1, 1], file, name)
                 lens = _lens({**content, **entry}, image)
-                depth = None if image is None else _named_file(file, entry, "depth_file_path")
-                mask = None if image is None else _named_file(file, entry, "mask_path")
+                depth, mask = (_named_file(file, entry, key) for key in ("depth_file_path", "mask_path"))
                 full_name, pose = _full_name(name, image), np.linalg.inv(pose)
                 images.append(PosedImage(full_name, image, lens, pose, depth, unit, held_out=held_out, mask=mask))
         up = _stated_up(content)
-        source_from_poses = _source_from_poses(content, scale)
+        source_from_poses = _source_from_world(file, content.get("applied_transform", np.eye(4)), scale)
         photographed = any(image.image is not None for image in images)  # poses alone need no points
         cloud = _named_file(file, content, "ply_file_path") if photographed else None
     points = () if cloud is None else load_point_cloud(cloud)
@@ -79,8 +76,8 @@ def _read_nerfstudio(path: Path) -> PosedImages:
 def _read_inria(file: Path, cameras: list[Any]) -> PosedImages:
     """The cameras of INRIA's cameras.json: position and rotation are camera-to-world, in OpenCV axes."""
     images = []
-    for index, camera in enumerate(cameras):
-        with reading(file, remedy="Copy it again from the folder of the training.", problem=f"camera {index} is wrong"):
+    with reading(file, remedy="Copy it again from the folder of the training.", problem="a camera is wrong"):
+        for camera in cameras:
             name, pose = str(camera["img_name"]), np.eye(4)
             pose[:3] = np.column_stack([camera["rotation"], camera["position"]])
             width, height, fx, fy = (_number(camera, key, 0.0) for key in ("width", "height", "fx", "fy"))
@@ -94,27 +91,22 @@ def _split_frames(file: Path, content: dict[str, Any]) -> tuple[list[tuple[dict[
 
     As nerfstudio does, frames that no list names are left out if the training frames and others are listed.
     """
-    notes, aside = [], [entry for key in ("val_frames", "test_frames") for entry in content.get(key) or []]
-    apart = {_plain_name(entry["file_path"]): entry for entry in aside}
-    lists = {key: {_plain_name(name) for name in content[key]} for key in _SPLITS if content.get(key)}
-    train = lists.get("train_filenames")
-    tested = {*apart}.union(*(names for key, names in lists.items() if key != "train_filenames")).difference(
-        train or ()
-    )
-    entries: list[tuple[dict[str, Any], bool | None]] = []
+    train, *others = ({_plain_name(name) for name in content.get(key) or ()} for key in _SPLITS)
+    tested = set().union(*others) - train
+    aside = [entry for key in ("val_frames", "test_frames") for entry in content.get(key) or ()]
+    entries: list[tuple[dict[str, Any], bool | None]] = [(entry, True) for entry in aside]
+    left_out = []
     for entry in content["frames"]:
-        name = entry.get("file_path") if isinstance(entry, dict) else None
-        name = _plain_name(name) if isinstance(name, str) else ""
-        if name in apart:
-            continue
-        if train is not None and tested and name not in train | tested:
-            notes.append(name)
-            continue
-        is_test = name in tested if train is None or tested else name not in train
-        entries.append((entry, is_test if lists or apart else None))
-    entries += [(entry, True) for entry in apart.values()]
-    if notes:
-        notes = [f"{len(notes)} frames that no list of the split names were left out (the first: {notes[0]})."]
+        name = _plain_name(entry["file_path"])
+        if train and tested and name not in train | tested:
+            left_out.append(name)
+        elif train or tested or aside:
+            entries.append((entry, name in tested if tested or not train else name not in train))
+        else:
+            entries.append((entry, None))
+    notes = []
+    if left_out:
+        notes.append(f"{len(left_out)} frames in no list of the split were left out (the first: {left_out[0]}).")
     records = [content, *(entry for entry, _ in entries)]
     keys = {key for record in records for key, value in record.items() if value not in (None, False, "", [])}
     if unused := sorted(keys - _KNOWN):
@@ -124,8 +116,7 @@ def _split_frames(file: Path, content: dict[str, Any]) -> tuple[list[tuple[dict[
 
 def _plain_name(name: str) -> str:
     """A frame's path with "/", without "./" and the suffix of an image."""
-    stem, suffix = os.path.splitext(name.replace("\\", "/").removeprefix("./"))
-    return stem if suffix.lower() in IMAGE_SUFFIXES else stem + suffix
+    return without_image_suffix(name.replace("\\", "/").removeprefix("./"))
 
 
 def _number(record: dict[str, Any], key: str, default: float) -> float:
@@ -145,13 +136,8 @@ def _matrix(rows: Any) -> Float[np.ndarray, "4 4"]:
 
 
 def _named_file(file: Path, record: dict[str, Any], key: str) -> Path | None:
-    """The file that an optional key names, which must exist."""
-    if not record.get(key):
-        return None
-    named = file.parent / record[key]
-    if not os.path.isfile(named):  # False also for a name that no file can have
-        raise InputError(named, f"there is no such file, which is the {key} of {file.name}", remedy="Check the path.")
-    return named
+    """The file that an optional key names."""
+    return file.parent / record[key] if record.get(key) else None
 
 
 def source_from_trained(file: Path) -> Float[np.ndarray, "4 4"]:
@@ -162,24 +148,15 @@ def source_from_trained(file: Path) -> Float[np.ndarray, "4 4"]:
     remedy = "Copy it again from the folder of the training."
     content = read_json(file, "a dataparser_transforms.json", remedy)
     with reading(file, remedy=remedy):
-        scale = _number(content, "scale", 1.0)
-        transform = make_rigid(_matrix(content["transform"]), file, "the trained world")
-        if not (scale > 0 and np.isfinite(transform).all()):
-            raise ValueError(f"its scale is {scale}, or its transform has no ordinary numbers")
-        return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ transform)
+        return _source_from_world(file, content["transform"], _number(content, "scale", 1.0))
 
 
-def _source_from_poses(content: dict[str, Any], scale: float) -> np.ndarray:
-    """(4, 4) inverse of world = applied_scale * (applied_transform source)."""
-    matrix = _matrix(content.get("applied_transform", np.eye(4)))
-    if not is_finite_and_bounded(matrix):
-        matrix = np.zeros((4, 4))
-    scaled = np.diag([scale, scale, scale, 1.0]) @ matrix
-    size = np.abs(scaled[:3, :3]).max()
-    turn = scaled[:3, :3] / size if size > 0 else np.zeros((3, 3))
-    if not (np.linalg.det(turn) > 0 and np.allclose(turn @ turn.T, (turn @ turn.T)[0, 0] * np.eye(3), atol=1e-3)):
-        raise ValueError("applied_transform or applied_scale cannot be inverted, or shears or mirrors")
-    return np.linalg.inv(scaled)
+def _source_from_world(file: Path, rows: Any, scale: float) -> Float[np.ndarray, "4 4"]:
+    """The inverse of world = scale * (transform source), with a rigid transform."""
+    transform = make_rigid(_matrix(rows), file, "the world")
+    if not (scale > 0 and np.isfinite(transform).all()):
+        raise ValueError(f"the scale of its world is {scale}, or the transform has no ordinary numbers")
+    return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ transform)
 
 
 def _full_name(name: str, image: Path | None) -> str:
@@ -207,15 +184,14 @@ def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
     """The lens of a frame by its keys and, after them, those of the file; None if neither gives its size."""
     model = str(keys.get("camera_model", "OPENCV")).upper()
     if model not in _PERSPECTIVE | _FISHEYE | {PANORAMA}:
-        known = ", ".join(sorted(_PERSPECTIVE | _FISHEYE | {PANORAMA}))
-        raise ValueError(f"camera_model {model} is none of {known}: undistort the images first")
+        raise ValueError(f"camera_model {model} is not read: undistort the images first")
     if other := next((key for key in ("ftheta_p0", "latlong", "equirectangular") if keys.get(key)), None):
         raise ValueError(f"its lens is one of instant-ngp's own, {other}: undistort the images first")
     is_fisheye = model in _FISHEYE or keys.get("is_fisheye") is True
     if keys.get("w") is not None and keys.get("h") is not None:
         width, height = (round(_number(keys, key, 0.0)) for key in ("w", "h"))
     elif image is not None:
-        width, height = size_around(image, keys.get("cx"), keys.get("cy"))
+        width, height = image_header(image).upright
     else:
         return None
     if model == PANORAMA:
@@ -230,9 +206,6 @@ def _lens(keys: dict[str, Any], image: Path | None) -> Lens | None:
         # nerfstudio's OPENCV has k1..k4 in one polynomial; OpenCV's own k4 divides. Not the same lens: refuse to guess.
         raise ValueError(f"k4 = {keys['k4']} with camera_model OPENCV: undistort the images first, or use FULL_OPENCV")
     cx, cy = _number(keys, "cx", width / 2), _number(keys, "cy", height / 2)
-    # Nobody has a lens of 160 degrees or more with its focal length in pixels, or its centre in the first pixel.
-    if min(width, height) >= 8 and (max(fx, fy) < min(10, width / 12) or max(cx, cy) <= 1):
-        raise ValueError("its intrinsics are shares of the image size: multiply them by w and h")
     return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jsecon.errors import InputError
 from jsecon.files import read_json, reading
-from jsecon.read.captures.frames import PosedImage, PosedImages
+from jsecon.read.captures.frames import PosedImage, PosedImages, pose_matrix
 from jsecon.read.captures.images import find_image
 from jsecon.read.captures.lens import Lens, panorama_lens
 from jsecon.read.registry import Reader
@@ -39,9 +38,7 @@ def _read_opensfm(path: Path) -> PosedImages:
         lenses = {name: _lens(file, name, camera) for name, camera in models[0]["cameras"].items()}
         images = []
         for name, shot in models[0]["shots"].items():
-            pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_rotvec(np.array(shot["rotation"], np.float64)).as_matrix()
-            pose[:3, 3] = shot["translation"]
+            pose = pose_matrix(Rotation.from_rotvec(np.array(shot["rotation"], np.float64)), shot["translation"])
             images.append(PosedImage(name, find_image(path / "images", name), lenses[shot["camera"]], pose))
         points = models[0].get("points", {}).values()
         places = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
@@ -55,8 +52,7 @@ def _lens(file: Path, name: str, camera: dict[str, Any]) -> Lens:
     if model in _PANORAMAS:
         return panorama_lens(file, width, height)
     if model not in _DISTORTION:
-        known = ", ".join((*_PANORAMAS, *_DISTORTION))
-        raise InputError(file, f"camera {name} has projection_type {model}", f"one of {known}", "Undistort first.")
+        raise ValueError(f"the projection_type {model} of camera {name} is not read: undistort the images first")
     side, distortion = max(width, height), [float(camera.get(key, 0.0)) for key in _DISTORTION[model]]
     fx, fy = (side * float(camera.get(key, camera.get("focal", 0.0))) for key in ("focal_x", "focal_y"))
     cx, cy = width / 2 + side * float(camera.get("c_x", 0.0)), height / 2 + side * float(camera.get("c_y", 0.0))

@@ -55,7 +55,5 @@ def cut_panoramas(posed: PosedImages) -> PosedImages:
     images = [image for image in posed.images if image.lens is None or not image.lens.panorama]
     images += [_cut_view(*panorama, view) for panorama in panoramas for view in range(len(PANORAMA_VIEWS))]
     each = f"{len(PANORAMA_VIEWS)} views each, of 95 degrees; what lies within 30 degrees of straight down is left out"
-    notes = [f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."]
-    if any(image.depth is not None for image, _ in panoramas):
-        notes.append("Depth maps of panoramas are not read.")
-    return dataclasses.replace(posed, images=images, notes=(*posed.notes, *notes))
+    note = f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."
+    return dataclasses.replace(posed, images=images, notes=(*posed.notes, note))

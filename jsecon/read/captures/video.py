@@ -12,15 +12,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from jsecon.errors import InputError
 from jsecon.files import reading
 from jsecon.read.captures.images import write_image
 from jsecon.types import Progress
 
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
-_COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")
-"""containers whose headers count frames; others have a duration, of which the count is an estimate"""
 
 
 def is_video(path: Path) -> bool:
@@ -30,7 +27,7 @@ def is_video(path: Path) -> bool:
 
 
 def write_frames(
-    video: Path, folder: Path, *, frames: int | None = None, progress: Progress | None = None
+    video: Path, folder: Path, frames: int, progress: Progress = lambda done, total: None
 ) -> tuple[list[Path], tuple[str, ...]]:
     """Writes the sharpest frame of each stretch of a video as a JPEG, named by its number in the video; adds notes.
 
@@ -45,15 +42,13 @@ def write_frames(
         shrink = min(1.0, 640 / max(grey.shape))  # at that size motion still blurs, and noise counts less
         small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         sharpness[number] = float(cv2.Laplacian(small, cv2.CV_32F).var())
-        if progress is not None:
-            progress(min(number + 1, total), 2 * total)
+        progress(min(number + 1, total), 2 * total)
     if not sharpness:
-        remedy = "Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."
-        with reading(video):
-            raise InputError(video, "OpenCV can read no frame of it", "a video", remedy)
+        with reading(video, remedy="Copy it again, or convert it (ffmpeg -i VIDEO walk.mp4)."):
+            raise ValueError("OpenCV can read no frame of it")
     numbers, values = np.array([*sharpness]), np.array([*sharpness.values()])
     end = int(numbers[-1]) + 1
-    edges = np.linspace(0, end, min(frames or DEFAULT_VIDEO_FRAMES, end) + 1).round().astype(int)
+    edges = np.linspace(0, end, min(frames, end) + 1).round().astype(int)
     places = np.searchsorted(numbers, edges)
     chosen = {int(numbers[a + np.argmax(values[a:b])]) for a, b in itertools.pairwise(places) if b > a}
     written = []
@@ -61,45 +56,33 @@ def write_frames(
         if number in chosen:
             written.append(folder / f"frame_{number:06d}.jpg")
             write_image(written[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-        if progress is not None:
-            progress(end + number + 1, 2 * end)
+        progress(end + number + 1, 2 * end)
     return written, (*_missing_notes(video, len(numbers), end, total), *_colour_notes(video))
 
 
 def _missing_notes(video: Path, count: int, end: int, total: int) -> tuple[str, ...]:
     """Says how many of `total` frames by the header cannot be decoded, `end` is the number behind the last of them."""
-    is_cut = total - end > (0 if video.suffix.lower() in _COUNTED else max(2, total // 50))
+    is_cut = total - end > max(2, total // 50)  # of some containers, the header has only the time
     failed = (total if is_cut else end) - count
-    if not failed:
-        return ()
     place = f", {total - end} of them at its end: it may be cut short" if is_cut else ""
     note = f"{failed} of {count + failed} frames of {video.name} cannot be decoded{place}."
-    return (f"{note} The others are used; copy the video again to have all.",)
+    return (f"{note} The others are used; copy the video again to have all.",) if failed else ()
 
 
 def read_header(video: Path) -> bytes:
-    """The first bytes of a video, or the box that describes it."""
+    """The first and the last bytes of a video: what describes it lies before or behind the pixels."""
     with video.open("rb") as file:
         head = file.read(1 << 16)
-        if head[4:8] in (b"ftyp", b"moov", b"wide", b"mdat", b"free"):  # boxes: moov, far behind the pixels, tells
-            place, size = 0, os.path.getsize(video)
-            while place < size:
-                file.seek(place)
-                box = file.read(16)
-                length, kind = int.from_bytes(box[:4], "big"), box[4:8]
-                length = int.from_bytes(box[8:], "big") if length == 1 else length or size - place
-                if kind == b"moov":
-                    file.seek(place)
-                    head = file.read(min(length, 1 << 26))
-                place += max(length, 8)
-    return head
+        file.seek(max(len(head), os.path.getsize(video) - (1 << 24)))
+        return head + file.read()
 
 
 def _colour_notes(video: Path) -> tuple[str, ...]:
     """Says that colours are off if a video is HDR, which OpenCV decodes as if it were not."""
     # Of ISO/IEC 23091-2's transfer characteristics, 16 is PQ (HDR10, Dolby Vision) and 18 is HLG.
-    found = re.search(rb"colr(?:nclx|nclc)..\0([\x10\x12])|\x55\xba\x81([\x10\x12])", read_header(video), re.DOTALL)
-    if found is None:
+    header = read_header(video)
+    boxes, matroska = rb"colr(?:nclx|nclc)..\0[\x10\x12]", rb"\x55\xba\x81[\x10\x12]"
+    if not re.search(boxes, header, re.DOTALL) and not re.search(matroska, header[: 1 << 16]):
         return ()
     sdr = "zscale=t=linear:npl=100,tonemap=hable,zscale=p=bt709:t=bt709:m=bt709,format=yuv420p"
     remedy = f"Convert it first: ffmpeg -i {video.name} -vf {sdr} walk.mp4"

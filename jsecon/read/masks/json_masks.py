@@ -7,17 +7,16 @@ add up.
 """
 
 import functools
-from collections.abc import Callable
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from jsecon.errors import InputError
 from jsecon.files import read_json, reading
-from jsecon.read.captures.images import MAX_PIXELS
+from jsecon.read.captures.images import MAX_PIXELS, without_image_suffix
 from jsecon.read.registry import Reader
 
 ReadMasks: TypeAlias = Callable[[tuple[int, int]], tuple[Path, np.ndarray | list[np.ndarray]]]
@@ -27,16 +26,13 @@ _MASK = '{"size": [H, W], "counts": a text or a list}, or polygons of three corn
 _JSON = 'a list of {"segmentation": ...}, or COCO\'s {"images", "annotations"}'
 
 
-def _decode_rle(rle: Any, where: str) -> Bool[np.ndarray, "h w"]:
-    """Decodes a run-length encoded mask; `where` names it for errors."""
-    height, width = rle["size"]
-    if not isinstance(height, int) or not isinstance(width, int):
-        raise ValueError("its size is not a pair of whole numbers")
-    counts = rle["counts"]
+def _decode_rle(rle: Any) -> Bool[np.ndarray, "h w"]:
+    """Decodes a run-length encoded mask."""
+    (height, width), counts = rle["size"], rle["counts"]
     runs = np.asarray(_parse_runs(counts) if isinstance(counts, str) else counts, np.int64)
-    valid = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all() and min(height, width) > 0
+    valid = runs.ndim == 1 and ((runs >= 0) & (runs <= MAX_PIXELS)).all()
     if not valid or height * width > MAX_PIXELS or runs.sum() != height * width:
-        raise InputError(where, f"the mask's runs fill {int(runs.sum())} of {height}x{width} pixels", _MASK, _REMEDY)
+        raise ValueError(f"its runs fill {int(runs.sum())} of {height}x{width} pixels")
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(width, height).T)
 
@@ -65,17 +61,17 @@ def _parse_runs(text: str) -> list[int]:
     return runs
 
 
-def _fill_polygons(polygons: list[Any], size: tuple[int, int], where: str) -> Bool[np.ndarray, "h w"]:
+def _fill_polygons(polygons: list[Any], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Draws COCO's polygons [[x, y, x, y, ...], ...], px, as one mask of `size` (width, height), edges included."""
     nested = all(isinstance(polygon, list) for polygon in polygons)
     corners = [np.asarray(each, np.float64).reshape(-1, 2) for each in (polygons if nested else [polygons])]
     if not all(len(each) > 2 and np.isfinite(each).all() for each in corners):
         raise ValueError("one of its polygons has no three corners")
+    if min(size) < 1 or size[0] * size[1] > MAX_PIXELS:
+        raise ValueError(f"its image is {size[0]}x{size[1]}")
     far = np.concatenate(corners)
     if (far < -1).any() or (far > np.array(size) + 1).any():  # corners may lie on the far edges
-        problem = f"the mask's polygons reach from {far.min(0).tolist()} to {far.max(0).tolist()} px"
-        remedy = 'Give the size of the image that they were drawn on ("images" with "width" and "height").'
-        raise InputError(where, problem, f"corners within {size[0]}x{size[1]}", remedy)
+        raise ValueError(f"its polygons reach from {far.min(0).tolist()} to {far.max(0).tolist()}, beyond {size} px")
     canvas = np.zeros(size[::-1], np.uint8)
     for each in corners:
         cv2.fillPoly(canvas, [np.round(each).astype(np.int32)], 1)
@@ -86,68 +82,55 @@ def _read_json_masks(file: Path, size: tuple[int, int], level: str) -> list[Bool
     """The masks of one frame, the best first. Polygons are drawn on `size` (width, height), or on the file's."""
     content = read_json(file, _JSON, _REMEDY)
     with reading(file, _JSON, _REMEDY, problem="it holds no masks"):
-        records = list(content["annotations"] if isinstance(content, dict) else content)
-        images = [content.get("image"), *content.get("images", [])[:1]] if isinstance(content, dict) else []
-        own = next(filter(None, map(_image_size, images)), None)
-    return _decode_records(file, records, own, size)[1]
+        content = content if isinstance(content, dict) else {"annotations": content}
+        image = [content.get("image"), *content.get("images", ())][-1]
+        return _decode_records(file, list(content["annotations"]), image, size)[1]
 
 
-def _decode_records(
-    file: Path, records: list[Any], own: tuple[int, int] | None, size: tuple[int, int]
-) -> tuple[Path, list[np.ndarray]]:
+def _decode_records(file: Path, records: list[Any], image: Any, size: tuple[int, int]) -> tuple[Path, list[np.ndarray]]:
     """The file, and the masks of its records, those with the best scores (SAM's stability times predicted IoU) first.
 
-    `own` is the (width, height) that the file gives for the image, which goes before `size`.
+    `image` is the record of the image in the file, whose size goes before `size`.
     """
+    size = (image["width"], image["height"]) if isinstance(image, dict) and "width" in image else size
     with reading(file, _JSON, _REMEDY, problem="a mask's score cannot be read"):
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
     masks = []
     for number in np.argsort(-np.asarray(scores), kind="stable"):
-        where = f"{file}, mask {number}"
-        with reading(where, _MASK, _REMEDY, problem="the mask cannot be read"):
+        with reading(f"{file}, mask {number}", _MASK, _REMEDY, problem="the mask cannot be read"):
             segmentation = records[number]["segmentation"]
             if isinstance(segmentation, dict):
-                masks.append(_decode_rle(segmentation, where))
+                masks.append(_decode_rle(segmentation))
             elif segmentation != []:
-                masks.append(_fill_polygons(list(segmentation), own or size, where))
+                masks.append(_fill_polygons(list(segmentation), size))
     return file, masks
 
 
-def _image_size(image: Any) -> tuple[int, int] | None:
-    """(width, height) of an image's record, or None."""
-    sides = [image.get(key) if isinstance(image, dict) else None for key in ("width", "height")]
-    width, height = (int(side) if isinstance(side, int | float) and 0 < side <= MAX_PIXELS else 0 for side in sides)
-    return (width, height) if 0 < width * height <= MAX_PIXELS else None
+def open_coco(folder: Path, names: Mapping[str, Sequence[str]]) -> dict[str, ReadMasks] | None:
+    """Opens the COCO file of all frames: `folder` itself, or the only JSON in it, if that is no frame's and has images.
 
-
-def open_coco(folder: Path, match: Callable[[PurePosixPath, str], Any]) -> dict[str, ReadMasks] | None:
-    """Opens the COCO file of all frames: `folder` itself, or the only JSON in it if that lists images.
-
-    `match` finds the `frame` of the path and the suffix of an image, or None.
+    `names` has what the image of each frame may be called, without its suffix and in small letters.
     """
     files = [folder] if folder.is_file() else list(folder.glob("*.json"))
-    if len(files) != 1 or files[0].suffix.lower() != ".json":
+    known = {name for own in names.values() for name in own}
+    if len(files) != 1 or files[0].suffix.lower() != ".json" or files[0].stem.lower() in known:
         return None
-    file = files[0]
-    if file != folder and match(PurePosixPath(file.name), ".json") is not None:
+    file, content = files[0], read_json(files[0], _JSON, _REMEDY)
+    if file != folder and "images" not in content:
         return None
-    content = read_json(file, _JSON, _REMEDY)
-    if file != folder and not (isinstance(content, dict) and "images" in content):
-        return None
-    readers: dict[str, ReadMasks] = {}
+    found: dict[str, ReadMasks] = {}
     with reading(file, _JSON, _REMEDY, problem="it is not a COCO file"):
         records: dict[Any, list[Any]] = {image["id"]: [] for image in content["images"]}
         for record in content["annotations"]:
             records[record["image_id"]].append(record)
-        for image in content["images"]:
-            found, own = match(PurePosixPath(str(image["file_name"])), ""), _image_size(image)
-            if found is not None:
-                readers[found.frame] = functools.partial(_decode_records, file, records[image["id"]], own)
-    if not readers:
-        first = content["images"][0]["file_name"] if content["images"] else "no image"
-        problem = f"none of its {len(records)} images is called like a frame (the first: {first})"
-        raise InputError(file, problem, remedy="Name the images like those of the capture.")
-    return readers
+        images = {str(image["file_name"]).lower(): image for image in content["images"]}
+        images |= {without_image_suffix(name): image for name, image in images.items()}
+        for frame, own in names.items():
+            for image in [images[name] for name in own if name in images][:1]:
+                found[frame] = functools.partial(_decode_records, file, records[image["id"]], image)
+        if not found:
+            raise ValueError(f"none of its {len(records)} images is called like a frame, as {next(iter(names))} is")
+    return found
 
 
 READER = Reader("SAM", (".json",), _read_json_masks)

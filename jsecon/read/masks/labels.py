@@ -7,7 +7,6 @@ belong to the mask), the objects of a category OR-ed, their boxes side by side.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -68,23 +67,17 @@ def _read(file: Path) -> LabelledFrame:
             raise ValueError(f"the image is {width}x{height}")
     for index, entry in enumerate(entries):
         with reading(file, expected, _REMEDY, problem=f"object {index} cannot be read"):
-            category = entry["category"]
-            if not isinstance(category, str):
-                raise ValueError(f"its category is {category!r}")
-            polygon = _numbers(entry, "segmentation", (-1, 2)).astype(np.int32)
-            box = _numbers(entry, "bbox", (1, 4)).astype(np.float32)
-        mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [polygon], 1).astype(bool)
+            category, polygon = entry["category"], np.array(entry["segmentation"], np.float64).reshape(-1, 2)
+            box = np.array(entry["bbox"], np.float64).reshape(1, 4)
+            if not isinstance(category, str) or not len(polygon):
+                raise ValueError(f"its category is {category!r}, with an outline of {len(polygon)} corners")
+            if not (np.abs(polygon).max() < 1e6 and np.abs(box).max() < 1e6):
+                raise ValueError("its segmentation or bbox is out of all range")
+        mask = cv2.fillPoly(np.zeros((height, width), np.uint8), [polygon.astype(np.int32)], 1).astype(bool)
+        box = box.astype(np.float32)
         if category in objects:
             before, boxes = objects[category]
             mask = mask | before
             box = boxes if (boxes == box).all(1).any() else np.concatenate([boxes, box])
         objects[category] = mask, box
     return LabelledFrame(name, width, height, objects)
-
-
-def _numbers(entry: Any, key: str, shape: tuple[int, int]) -> np.ndarray:
-    """The numbers of an entry as an array; a dimension of `shape` may be -1."""
-    array = np.array(entry[key], np.float64).reshape(shape)
-    if not np.isfinite(array).all() or np.abs(array).max(initial=0) > 1e6 or not len(array):
-        raise ValueError(f"its {key} is empty or out of all range")
-    return array

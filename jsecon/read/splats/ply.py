@@ -56,7 +56,6 @@ class _Header:
     form: str
     """One of ORDERS."""
     elements: list[_Element]
-    comments: tuple[str, ...]
     start: int
     """Offset of the first byte after the header."""
 
@@ -68,14 +67,12 @@ def _parse_header(data: memoryview) -> _Header:
     end = re.search(last, data[: 1 << 24]) if data[:3] == b"ply" else None
     if end is None:
         raise ValueError("it has no .ply header" if len(data) else "the file is empty")
-    form, elements, comments = "", [], []
+    form, elements = "", []
     for line in bytes(data[: end.start()]).decode("ascii", "replace").splitlines()[1:]:
         try:
             match line.split():
-                case []:
+                case [] | ["comment" | "obj_info", *_]:
                     pass
-                case ["comment" | "obj_info", *words]:
-                    comments.append(" ".join(words))
                 case ["format", form, *_]:
                     pass
                 case ["element", name, count] if int(count) >= 0:
@@ -91,7 +88,7 @@ def _parse_header(data: memoryview) -> _Header:
             raise ValueError(f"the header line {line.strip()!r} is not valid") from error
     if form not in ORDERS:
         raise ValueError(f"its format is {form!r}, expected one of {', '.join(ORDERS)}")
-    return _Header(form, elements, tuple(comments), end.end())
+    return _Header(form, elements, end.end())
 
 
 def read_ply_file(path: Path) -> tuple[memoryview, _Header]:
@@ -174,7 +171,7 @@ def read_ply(path: Path) -> Gaussians:
         sh[rows, 1:] = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
         if filters:
             _fuse_filter(log_scales[rows], logits[rows], _columns(vertices, filters)[:, 0])
-    return drawable_gaussians(path, means, log_scales, quaternions, logits, sh)
+    return Gaussians(means, log_scales, quaternions, logits, sh)
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -194,17 +191,6 @@ def _fuse_filter(log_scales: np.ndarray, logits: np.ndarray, deviation: np.ndarr
     logits[:] = np.log(opacity) - np.log1p(-opacity)
 
 
-def drawable_gaussians(path: Path, means: np.ndarray, *others: np.ndarray) -> Gaussians:
-    """Makes Gaussians of NumPy arrays of a file, in the order of their fields; refuses numbers that cannot be drawn.
-
-    All become float32, but for means of float64.
-    """
-    kinds = (np.float64 if means.dtype == np.float64 else np.float32, *(4 * (np.float32,)))
-    gaussians = Gaussians(*(np.require(array, kind, "C") for array, kind in zip((means, *others), kinds)))
-    _require_drawable(path, gaussians, 0, "Remove these Gaussians (SuperSplat drops them on loading), or train again.")
-    return gaussians
-
-
 def usable_blocks(
     path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
 ) -> Iterator[tuple[slice, Gaussians]]:
@@ -213,18 +199,19 @@ def usable_blocks(
     The Gaussians may be memory-mapped. A Gaussian that cannot be drawn is an error: `load_gaussians` would refuse it.
     """
     for rows, block in transform_blocks(gaussians, similarity):
-        _require_drawable(path, block, rows.start, "Remove these Gaussians first.")
+        require_drawable(path, block, rows.start, "Remove these Gaussians first.")
         yield rows, block
 
 
-def _require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy: str) -> None:
+def require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy: str) -> None:
     """Raises InputError if a Gaussian, counted from `first`, cannot be drawn."""
     for name, array in vars(gaussians).items():
         rows = unusable_rows(name, array)
         if rows.any():
             state = "not finite or zero" if name == "quaternions" else "not finite"
-            example = f"(the first: {first + rows.argmax()})"
-            problem = f"{name} of {rows.sum()} of {len(rows)} Gaussians are {state} {example}"
+            problem = (
+                f"{name} of {rows.sum()} of {len(rows)} Gaussians are {state} (the first: {first + rows.argmax()})"
+            )
             raise InputError(path, problem, remedy=remedy)
 
 
@@ -252,9 +239,8 @@ def save_ply(
             file.write(_table(block, is_double, own).tobytes())  # tofile hides a full disk
 
 
-def _header(count: int, properties: list[str], comment: str = "") -> bytes:
-    comments = [f"comment {comment}"] if comment else []
-    start = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {count}"]
+def _header(count: int, properties: list[str]) -> bytes:
+    start = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     return "\n".join([*start, *properties, "end_header\n"]).encode()
 
 
@@ -287,11 +273,11 @@ def _table(block: Gaussians, is_double: bool, ids: Mapping[str, np.ndarray]) -> 
     return rows
 
 
-def write_vertices(path: Path, columns: Sequence[tuple[str, str, np.ndarray]], comment: str = "") -> None:
+def write_vertices(path: Path, columns: Sequence[tuple[str, str, np.ndarray]]) -> None:
     """Writes a .ply of vertices: names, types (a .ply's words) and columns of their properties."""
     rows = np.empty(len(columns[0][2]), [(name, "<" + _TYPES[kind]) for name, kind, _ in columns])
     for name, _, column in columns:
         rows[name] = column
-    with path.open("wb") as file:
-        file.write(_header(len(rows), [f"property {kind} {name}" for name, kind, _ in columns], comment))
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(len(rows), [f"property {kind} {name}" for name, kind, _ in columns]))
         file.write(rows.tobytes())

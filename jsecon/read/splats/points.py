@@ -149,14 +149,12 @@ READERS = (
 )
 
 
-def load_point_cloud(path: str | Path) -> _PointCloud:
+def load_point_cloud(path: Path) -> _PointCloud:
     """Reads a point cloud of any of these formats."""
-    path = Path(path)
     reader = next((reader for reader in READERS if reader.fits(path)), None)
-    if reader is None:
-        expected = "points as .las, .laz, .e57, .pcd, .xyz, .txt or .ply"
-        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", expected, "Convert it to a .laz.")
-    with reading(path, remedy="Export the file again."):
+    with reading(path, remedy="Export the file again, as a .laz for example."):
+        if reader is None:
+            raise ValueError(f"{path.suffix or 'no suffix'} is none of .las, .laz, .e57, .pcd, .xyz, .txt and .ply")
         cloud = reader.read(path)
         if not len(cloud.points):
             raise ValueError("it has no points")
@@ -198,7 +196,7 @@ def read_crs(path: Path) -> str:
 
 
 def save_point_cloud(
-    path: Path, source: Path, rows: Int[np.ndarray, " m"], ids: Mapping[str, Int[np.ndarray, " m"]], crs: str
+    path: Path, source: Path, rows: Int[np.ndarray, " m"], ids: Mapping[str, Int[np.ndarray, " m"]]
 ) -> None:
     """Writes rows of the points of a file with ids of each, int32.
 
@@ -212,12 +210,9 @@ def save_point_cloud(
         columns = [(axis, "double", points[rows, n]) for n, axis in enumerate("xyz")]
         columns += [(name, "uchar", colors[rows, n]) for n, name in enumerate(_COLOURS[0])]
         columns += [(name, "int", column) for name, column in ids.items()]
-        with atomic_write(path) as temporary:
-            write_vertices(temporary, columns, f"crs {crs}" if crs.startswith("EPSG:") else "")
-        return
+        return write_vertices(path, columns)
     if source.suffix.lower() not in (".las", ".laz"):
-        problem = f"the points of {source.name} cannot be written as {path.suffix}"
-        raise InputError(path, problem, remedy="Write a .ply.")
+        raise InputError(path, f"the points of {source.name} are no {path.suffix}", remedy="Write a .ply.")
     with decoding(source, "laspy") as laspy:
         las = laspy.read(source)
         las.points = las.points[rows]
