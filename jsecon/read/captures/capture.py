@@ -221,7 +221,8 @@ def _no_capture(path: Path) -> InputError:
     entries = sorted(child for child in path.iterdir() if not child.name.startswith("."))
     problem = f"a folder without poses and photographs, but with {join_first([child.name for child in entries])}"
     remedy = "Give a folder with images/ and sparse/0, with transforms.json, or with photographs in it."
-    scenes = [*path.glob("point_cloud/*/*.ply"), *(child for child in entries if child.suffix.lower() in SCENES[:-1])]
+    trained = sorted(path.glob("point_cloud/*/*.ply"), key=lambda file: -file.stat().st_mtime)  # INRIA's
+    scenes = [*trained, *(child for child in entries if child.suffix.lower() in SCENES[:-1])]
     if not entries:
         problem, remedy = "an empty folder", "Copy the capture there, or check the path."
     elif photos := unposed_photographs(path)[0]:
