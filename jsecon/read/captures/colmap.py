@@ -84,16 +84,12 @@ def _model_file(model: Path, kind: str) -> Path:
 
 
 def _find_images(path: Path, names: Sequence[str], more: Sequence[Path]) -> dict[str, Path]:
-    """The image files of a model by name: all in one folder, else those in the first that has any."""
+    """The image files of a model by name, in the first folder that has any."""
     for name in names:
         path_within(path / "images", name)  # a name must not lead elsewhere
-    some: dict[str, Path] = {}
-    for folder in (path / "images", path, path / "input", *more):
-        files = {name: file for name in names if (file := find_image(folder, name)) is not None}
-        if len(files) == len(set(names)):
-            return files
-        some = some or files
-    return some
+    folders = (path / "images", path, path / "input", *more)
+    found = ({name: file for name in names if (file := find_image(folder, name)) is not None} for folder in folders)
+    return next(filter(None, found), {})
 
 
 _reading = functools.partial(reading, remedy=_REMEDY, problem="the file is damaged or breaks off")

@@ -41,8 +41,7 @@ _UNREAD = re.compile(
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[ImageFile]:
     """Opens an image; only its header is read. Errors of the decoder in the body of the `with` become InputErrors."""
-    again = "Copy or export the file again."
-    with reading(path, remedy=again, problem="the image cannot be read"), path.open("rb") as file:
+    with reading(path, remedy="Copy the file again.", problem="the image cannot be read"), path.open("rb") as file:
         if remedy := unread_remedy(path):
             raise InputError(path, f"{path.suffix} images are not read", remedy=remedy)
         head = file.read(12)

@@ -264,8 +264,7 @@ def load_labels(
     things = np.median([_count_things(frame) for frame in labels])
     if len(ids) > 10 * max(things, 1):
         hint = f"There are {len(ids)} ids, but a frame shows some {things:.0f} connected things."
-        reasons = "If each frame numbers its masks anew, give them as --proposals"
-        notes.append(f"{hint} {reasons}; if colours were smoothed or compressed, export the masks again.")
+        notes.append(f"{hint} Give masks that each frame numbers anew as --proposals; export smoothed colours again.")
     return _TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
 
 
