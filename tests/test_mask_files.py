@@ -158,8 +158,8 @@ def test_what_a_mask_may_be_called(tmp_path, frame, file):
     image = ids_image()
     write(tmp_path / file, image)
     write(tmp_path / "b.png", image)
-    files = photographs("cam0/a.jpg", "cam1/a.jpg", "b.jpg") if frame == "cam0_a" else {}
-    labels, _, notes = load_labels(tmp_path, (frame, "b"), FRAME, frames=files or None)
+    files = photographs(*(("cam0/a.jpg", "cam1/a.jpg") if frame == "cam0_a" else (f"{frame}.jpg",)), "b.jpg")
+    labels, _, notes = load_labels(tmp_path, (frame, "b"), FRAME, frames=files)
     np.testing.assert_array_equal(labels, np.stack([image, image]) - 1)
     assert not notes
 

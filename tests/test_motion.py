@@ -236,7 +236,7 @@ def test_depth_maps_and_masks_of_any_name_are_told_by_their_bits(tmp_path, kind)
     assert [path.name for path in photographs_of(tmp_path)] == ["a.jpg", "b.jpg"]
     for name in "ab":
         (tmp_path / f"{name}.jpg").unlink()
-    with refused(tmp_path.name, "no photographs", "c.png"):
+    with refused(tmp_path.name, "without poses and photographs", "c.png"):
         load_capture(tmp_path)
 
 

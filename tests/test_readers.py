@@ -173,10 +173,10 @@ DAMAGE = {
     "images/plain.jpg": [(edit("", cut_behind_a_thumbnail), "truncated")],
     "depths/depth.png": [(put("", np.ones((4, 5, 3), np.uint8)), "uint8")],
     "masks/grey": [
-        (shutil.rmtree, "no such folder"), (emptied, "0 masks", "a.png"),
+        (shutil.rmtree, "no such folder"), (emptied, "no mask", "a.png"),
         (lambda entry: [file.rename(entry / f"0{file.name}") for file in [*entry.iterdir()]], "called like a frame"),
         (edit("a.png", lambda data: data[:-20]), "a.png", "cannot be read"),
-        (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "transparency"),
+        (put("a.png", IDS.T), "a.png", "24x36", "36x24"), (put("a.png", np.dstack([IDS] * 4)), "4 channels"),
         (put("a.png", np.dstack([IDS.astype(np.uint16)] * 3)), "16 bits"),
     ],
     "proposals/levels": [

@@ -118,7 +118,7 @@ def find_poses(
     require_pycolmap(where)
     original = _check_photographs(photos, where)
     with ThreadPoolExecutor(cores()) as pool:  # reads all pixels: a damaged photograph is an error now
-        sizes = [image.shape[1::-1] for image, _ in pool.map(read_image, photos)]
+        sizes = [image.shape[1::-1] for image in pool.map(read_image, photos)]
     links: list[str] = []
     for number, photo in enumerate(photos):
         # COLMAP ignores EXIF orientations and reads no HEIC and AVIF: it gets a copy of the upright pixels.

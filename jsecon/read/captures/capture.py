@@ -186,8 +186,9 @@ def _capture_above(path: Path) -> tuple[Path, str] | None:
     for folder in place.parents[:3]:
         reader = _find_reader(folder)
         with contextlib.suppress(InputError):  # then its photographs are no capture
-            images = [image.image for image in read_posed_images(folder).images] if reader else []
-            if any(image is not None and place in Path(os.path.abspath(image)).parents for image in images):
+            images = [] if reader is None else [image.image for image in read_posed_images(folder).images]
+            places = [Path(os.path.abspath(image)).parents for image in images if image is not None]
+            if reader is not None and any(place in parents for parents in places):
                 return folder, reader.name
     return None
 

@@ -18,6 +18,8 @@ from jsecon.types import Progress
 
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
+_COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")
+"""containers whose headers count frames; others have a duration, of which the count is an estimate"""
 
 
 def is_video(path: Path) -> bool:
@@ -62,7 +64,7 @@ def write_frames(
 
 def _missing_notes(video: Path, count: int, end: int, total: int) -> tuple[str, ...]:
     """Says how many of `total` frames by the header cannot be decoded, `end` is the number behind the last of them."""
-    is_cut = total - end > max(2, total // 50)  # of some containers, the header has only the time
+    is_cut = total - end > (0 if video.suffix.lower() in _COUNTED else max(2, total // 50))
     failed = (total if is_cut else end) - count
     place = f", {total - end} of them at its end: it may be cut short" if is_cut else ""
     note = f"{failed} of {count + failed} frames of {video.name} cannot be decoded{place}."
