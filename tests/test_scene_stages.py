@@ -165,7 +165,7 @@ def test_a_file_whose_float32_has_rounded_the_places_is_told(tmp_path, near):
 
 
 @pytest.mark.parametrize(("told", "says"), [
-    ({"scale": 1.0}, "'transform' is missing"), ({"transform": TURN[:3].tolist(), "scale": 0}, "scale of its world is 0"),
+    ({"scale": 1.0}, "'transform' is missing"), ({"transform": TURN[:3].tolist(), "scale": 0}, "its world is 0"),
     ({"transform": (2 * TURN[:3]).tolist(), "scale": 1.0}, "not rigid"),
     ({"transform": [[1, 2]], "scale": 1.0}, "shape (1, 2)"),
 ])  # fmt: skip
