@@ -21,7 +21,6 @@ from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row, forge
 from jsecon.field.ledger_file import ledger_file, load_ledger, save_with_ledger
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
-from jsecon.pipeline.sources import locate_sources
 from jsecon.types import Regions
 
 NAMES = "view_2", "view_9", "view_10", "view_11"
@@ -151,18 +150,6 @@ def test_a_stop_leaves_the_old_field(scene, cameras, labels, rows, views, tmp_pa
     assert {*again.ledger.views} == {*NAMES}
     again.forget([NAMES[0]]).save(path)
     assert len(files(tmp_path)) == 2
-
-
-def test_a_field_in_another_folder_still_finds_its_capture(scene, cameras, tmp_path):
-    (tmp_path / "a" / "capture").mkdir(parents=True)
-    hints = json.dumps({"folders": {"capture": "capture"}})
-    save_with_ledger(
-        tmp_path / "a" / "field.safetensors", dataclasses.replace(make_field(scene, cameras)[0], provenance=hints), None
-    )
-    open_scene(tmp_path / "a").save(tmp_path / "b" / "c" / "field.safetensors")
-    found = locate_sources(load_field(tmp_path / "b" / "c" / "field.safetensors")).capture
-    assert found is not None
-    assert found.samefile(tmp_path / "a" / "capture")
 
 
 def files(folder):

@@ -153,7 +153,7 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
     with refused("--embedder DIR"):
         model_loading.field_embedder(lost)
     assert model_loading.field_embedder(lost, models[1]).name == lost.embedder
-    with refused("Run the capture again"):
+    with refused("run the capture again"):
         model_loading.field_embedder(dataclasses.replace(lost, embedder="colours-of-the-future"))
 
 

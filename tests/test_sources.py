@@ -1,4 +1,4 @@
-"""Where a field says that its model and its capture are: hints of a stranger, which open nothing of themselves."""
+"""Where a field says that its model and its points are: hints of a stranger, which open nothing of themselves."""
 
 import dataclasses
 import json
@@ -6,10 +6,10 @@ import json
 import pytest
 
 from jsecon import InputError, load_field, save_field
+from jsecon.field.field import Provenance
 from jsecon.pipeline.model_loading import field_embedder
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import locate_sources, provenance
-from jsecon.vision.colours import ColourEmbedder
+from jsecon.pipeline.sources import _relative_folders, locate_sources
 
 CLIP = "clip-0123456789abcdef"
 
@@ -19,38 +19,41 @@ def told(field, **given):
 
 
 def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, tmp_path):
-    out, model = tmp_path / "runs" / "a", tmp_path / "models" / "clip"
-    for folder in (out, model, tmp_path / "capture"):
+    out, model, scan = tmp_path / "runs" / "a", tmp_path / "models" / "clip", tmp_path / "scan.las"
+    for folder in (out, model):
         folder.mkdir(parents=True)
-    hints = json.loads(provenance(Options(tmp_path / "capture", embedder=model), {}, CLIP, out))["folders"]
-    assert hints == {"capture": "../../capture", "embedder": "../../models/clip"}
-    own = told(field, folders=hints, embedder=CLIP)
+    given = Options(tmp_path / "capture", embedder=model, points=scan)
+    scan.touch()
+    hints = _relative_folders(given, out)
+    assert hints == {"points": "../../scan.las", "embedder": "../../models/clip"}
+    own = told(field, folders=hints)
     save_field(out / "field.safetensors", own)
-    for found in (locate_sources(load_field(out / "field.safetensors")), locate_sources(own, out)):
-        assert found[:3] == (CLIP, model, tmp_path / "capture")
-    assert locate_sources(own)[:3] == (CLIP, None, None)  # of a field that no file was read of
+    assert locate_sources(load_field(out / "field.safetensors")) == (model, "", scan)
+    assert locate_sources(own) == (None, "", None)  # of a field that no file was read of
 
 
 def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path):
     for hint in ("/etc", "//host/share", "C:\\models", "C:models", "\\\\host\\share", "a\0b", "x" * 9000):
-        own = told(field, folders={"capture": hint, "embedder": hint}, embedder=CLIP, options={"embedder": hint})
-        assert locate_sources(own, tmp_path)[:3] == (CLIP, None, None)
+        own = told(field, folders={"points": hint, "embedder": hint}, options={"embedder": hint})
+        save_field(tmp_path / "field.safetensors", own)
+        assert locate_sources(load_field(tmp_path / "field.safetensors")) == (None, "", None)
 
 
 def test_a_model_of_another_name_is_not_opened(field, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "visual.onnx").write_bytes(b"no graph")
-    own = dataclasses.replace(told(field, folders={"embedder": "model"}, embedder=CLIP), embedder=CLIP)
+    own = dataclasses.replace(told(field, folders={"embedder": "model"}), embedder=CLIP)
     save_field(tmp_path / "field.safetensors", own)
     with pytest.raises(InputError, match="--embedder DIR"):
         field_embedder(load_field(tmp_path / "field.safetensors"))
 
 
-MALFORMED = "[]", '{"folders": 3}', '{"folders": {"embedder": 7}}', '{"embedder": {}}', "{"
+MALFORMED = "[]", '{"folders": 3}', '{"folders": {"embedder": 7}}', "{"
 
 
 @pytest.mark.parametrize("provenance", MALFORMED)
-def test_a_malformed_provenance_is_refused_in_words(field, provenance):
-    own = dataclasses.replace(field, provenance=provenance, embedder=ColourEmbedder().name)
+def test_a_malformed_provenance_is_refused_in_words(field, provenance, tmp_path):
+    own = dataclasses.replace(field, provenance=Provenance(provenance), embedder=CLIP)
+    own.provenance.folder = tmp_path
     with pytest.raises(InputError, match="provenance is not what jsecon run writes"):
         field_embedder(own)

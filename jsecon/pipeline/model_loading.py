@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import get_args
 
 from jsecon.errors import InputError
 from jsecon.networks.hub import RECOMMENDED, HubModel, Role, parse_model
@@ -17,9 +17,6 @@ from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Models
 from jsecon.vision.stores import StoredSegmenter
-
-if TYPE_CHECKING:
-    from jsecon.networks.clip import ClipEmbedder
 
 
 def _local_folders(models: Mapping[Role, HubModel | Path]) -> dict[Role, Path]:
@@ -59,36 +56,18 @@ def open_models(options: Options, store: Path) -> Models:
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(Path(options.tracker))
-    return Models(_open_embedder(folder=options.embedder), segmenter, tracker)
+    return Models(_open_embedder(options.embedder), segmenter, tracker)
 
 
-def _open_embedder(name: str | None = None, *, folder: str | Path | None = None) -> Embedder:
-    """Opens an embedder: CLIP if one is named, else colours. InputError is raised if it is of another space.
+def _open_embedder(folder: str | Path | None) -> Embedder:
+    """Opens CLIP from a folder, a name or an address; colours if there is none."""
+    if folder is None:
+        from jsecon.vision.colours import ColourEmbedder
 
-    Args:
-      name: Name of the space, or None for any.
-      folder: Folder, name or address of a CLIP model.
-    """
-    if folder is not None:
-        from jsecon.networks.clip import ClipEmbedder
+        return ColourEmbedder()
+    from jsecon.networks.clip import ClipEmbedder
 
-        folder = _local_folders({"embedder": parse_model(folder, "embedder")})["embedder"]
-        clip = ClipEmbedder(folder)
-        return _of_space(clip, name, "Give the model that the field was made with: --embedder DIR.")
-    from jsecon.vision.colours import ColourEmbedder
-
-    if name is not None and name.startswith("clip-"):
-        remedy = "Give the folder of the model that the field was made with (--embedder DIR), or run again without."
-    else:
-        remedy = "Run the capture again with this version."
-    return _of_space(ColourEmbedder(), name, remedy)
-
-
-def _of_space(embedder: Any, name: str | None, remedy: str) -> Embedder:
-    """Returns the embedder if it is of a space, or of any if the name is None; else raises InputError."""
-    if name not in (None, embedder.name):
-        raise InputError("field", f"regions embedded by {name!r}", f"{embedder.name!r}", remedy)
-    return embedder
+    return ClipEmbedder(_local_folders({"embedder": parse_model(folder, "embedder")})["embedder"])
 
 
 def field_embedder(field: LanguageField, folder: str | Path | None = None) -> Embedder:
@@ -99,33 +78,29 @@ def field_embedder(field: LanguageField, folder: str | Path | None = None) -> Em
       folder: Folder, name or address of the model; None looks where the run had it and in the hub's cache, and takes it
         only if its content is the same.
     """
-    if folder is None:
-        model = _find_model(field)
-        if isinstance(model, HubModel):
-            problem = f"its texts need the model {model.address}, which is not on this machine"
-            raise InputError("field", problem, "", f"Fetch it with: {model.get_command}.")
-        if model is not None:
-            return _of_space(model, field.embedder, "")
-    return _open_embedder(field.embedder, folder=folder)
+    embedder = (_find_model(field) if folder is None else None) or _open_embedder(folder)
+    if embedder.name != field.embedder:
+        remedy = "Give the model that the field was made with (--embedder DIR), or run the capture again."
+        raise InputError("field", f"regions embedded by {field.embedder!r}", repr(embedder.name), remedy)
+    return embedder
 
 
-def _find_model(field: LanguageField) -> "ClipEmbedder | HubModel | None":
+def _find_model(field: LanguageField) -> Embedder | None:
     """Looks for the CLIP model that a field was made with, in its folder and in the hub's cache.
 
-    Returns the model if it is on this machine, else the one of the hub that is to be fetched; None for a field without
-    a model, or if its model came from a folder that is not here.
+    Returns None if it is on neither. InputError is raised if it is to be fetched from the hub.
     """
-    sources = locate_sources(field)
-    if not (sources.embedder or "").startswith("clip-"):
+    if not field.embedder.startswith("clip-"):
         return None
-    from jsecon.networks.clip import ClipEmbedder
-
-    model = None if sources.address is None else parse_model(sources.address, "embedder")
-    on_hub = model if isinstance(model, HubModel) else None
-    for folder in (sources.model, None if on_hub is None else on_hub.cached_folder):
+    sources = locate_sources(field)
+    on_hub = parse_model(sources.address, "embedder") if sources.address else None
+    for folder in (sources.model, on_hub.cached_folder if isinstance(on_hub, HubModel) else None):
         if folder is not None:
             with contextlib.suppress(InputError):  # another model is there now
-                embedder = ClipEmbedder(folder)
-                if embedder.name == sources.embedder:
+                embedder = _open_embedder(folder)
+                if embedder.name == field.embedder:
                     return embedder
-    return on_hub
+    if isinstance(on_hub, HubModel):
+        problem = f"its texts need the model {on_hub.address}, which is not on this machine"
+        raise InputError("field", problem, "", f"Fetch it with: {on_hub.get_command}.")
+    return None

@@ -274,7 +274,7 @@ def run(
     started = time.monotonic()
     with console.progress("field"):
         warnings = [note.removeprefix(WARNING) for note in state.notes if note.startswith(WARNING)]
-        origin = provenance(context.options, state.keys, embedder.name, out, warnings)
+        origin = provenance(context.options, state.keys, out, warnings)
         field = join_field(results, embedder, origin, context.options)
         field = save_with_ledger(out / FIELD_FILE, field, _make_ledger(results) if options.ledger else None)
     seconds["field"] = time.monotonic() - started

@@ -1,4 +1,4 @@
-"""Where the model and the capture of a field are: the hints that a run writes into a field, and what they lead to.
+"""Where the model and the points of a field are: the hints that a run writes into a field, and what they lead to.
 
 A field may come from anybody. So its hints are paths relative to its file, absolute paths are never opened, and a model
 is used only if the name that follows from its content is the one that the run used.
@@ -11,11 +11,10 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jsecon
 from jsecon.errors import InputError
-from jsecon.field.field import Provenance
 from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options, is_bare_scene
@@ -27,25 +26,21 @@ from jsecon.types import LanguageField
 class _Sources(NamedTuple):
     """What the hints of a field lead to."""
 
-    embedder: str | None
-    """name of the embedder that the run used"""
     model: Path | None
-    """its folder, if that still exists"""
-    capture: Path | None
-    """folder of the capture, if that still exists"""
+    """folder of the model of the run, if that still exists"""
+    address: str
+    """where the model is on the hub ("hub:owner/name@commit"); empty if the run did not take it from there"""
     points: Path | None
     """file of the points or Gaussians that the run was given, if that still exists"""
-    address: str | None = None
-    """where the model is on the hub ("hub:owner/name@commit"), if the run took it from there"""
 
 
-def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path, warnings: Sequence[str] = ()) -> str:
+def provenance(options: Options, keys: dict[str, str], out: Path, warnings: Sequence[str] = ()) -> str:
     """Writes where the field of a run comes from, and what the run warned of."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     folders = {name: getattr(options, name) for name in ("segmenter", "tracker", "embedder")}
     addresses = {name: cached_address(folder) for name, folder in folders.items() if isinstance(folder, Path)}
     models = {name: address for name, address in addresses.items() if address is not None}
-    origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys, "embedder": embedder}
+    origin = {"jsecon": jsecon.__version__, "options": values | models, "keys": keys}
     origin |= {"folders": _relative_folders(options, out), "models": models, "warnings": list(warnings)}
     cloud = _given_points(options)
     origin["crs"] = "" if cloud is None else read_crs(cloud)
@@ -55,27 +50,9 @@ def provenance(options: Options, keys: dict[str, str], embedder: str, out: Path,
 
 def forget_warnings(field: LanguageField, names: Sequence[str]) -> LanguageField:
     """Leaves out what the run warned of some frames."""
-    warnings = parse_json(field.provenance).get("warnings", [])
-    kept = [text for text in warnings if not any(name in text for name in names)]
-    return _with_origin(field, getattr(field.provenance, "folder", None), warnings=kept)
-
-
-def move_hints(field: LanguageField, folder: Path) -> LanguageField:
-    """Makes the hints of a field, which are relative to its file, those of a file in another folder."""
-    if (before := getattr(field.provenance, "folder", None)) in (None, folder.resolve()):
-        return field
-    hints = {kind: _resolve(before, hint) for kind, hint in parse_json(field.provenance).get("folders", {}).items()}
-    with contextlib.suppress(ValueError):  # another drive of Windows
-        hints = {k: Path(os.path.relpath(path, folder.resolve())).as_posix() for k, path in hints.items() if path}
-        return _with_origin(field, folder.resolve(), folders=hints)
-    return _with_origin(field, folder.resolve(), folders={})
-
-
-def _with_origin(field: LanguageField, folder: Path | None, **changes: Any) -> LanguageField:
-    provenance = Provenance(json.dumps(parse_json(field.provenance) | changes, sort_keys=True))
-    if folder is not None:
-        provenance.folder = folder
-    return dataclasses.replace(field, provenance=provenance)
+    origin = parse_json(field.provenance)
+    origin["warnings"] = [text for text in origin.get("warnings", []) if not any(name in text for name in names)]
+    return dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
 
 
 def run_warnings(field: LanguageField) -> list[str]:
@@ -96,34 +73,28 @@ def _given_points(options: Options) -> Path | None:
 def _relative_folders(options: Options, out: Path) -> dict[str, str]:
     """Folders of options, relative to the output folder."""
     folders = {}
-    for name in ("embedder", "capture", "points"):
-        folder = _given_points(options) if name == "points" else getattr(options, name)
-        if folder is not None and cached_address(folder) is None:
-            try:
+    for name, folder in (("embedder", options.embedder), ("points", _given_points(options))):
+        if folder is not None and cached_address(Path(folder)) is None:
+            with contextlib.suppress(ValueError):  # another drive of Windows: the user must name the folder again
                 folders[name] = Path(os.path.relpath(os.path.realpath(folder), os.path.realpath(out))).as_posix()
-            except ValueError:  # another drive of Windows: the user must name the folder again
-                continue
     return folders
 
 
-def locate_sources(field: LanguageField, beside: Path | None = None) -> _Sources:
-    """Locates the model and the capture of a field by the hints of its run."""
-    beside = getattr(field.provenance, "folder", None) if beside is None else beside
+def locate_sources(field: LanguageField) -> _Sources:
+    """Locates the model and the points of a field by the hints of its run."""
+    beside = getattr(field.provenance, "folder", None)
     try:
-        provenance = parse_json(field.provenance or "{}")
-        folders, models = (provenance.get(name, {}) for name in ("folders", "models"))
-        name = provenance.get("embedder", "")
-        if not all(isinstance(hint, str) for hint in (name, *folders.values(), *models.values())):
-            raise ValueError("a hint is not a text")
+        origin = parse_json(field.provenance or "{}")
+        folders, models = (origin.get(name, {}) for name in ("folders", "models"))
+        model, points = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "points"))
+        return _Sources(model, str(models.get("embedder", "")), points)
     except (ValueError, TypeError, AttributeError) as error:
-        remedy = "Give the folders yourself, with --embedder and --images, or run the capture again."
+        remedy = "Give the model yourself (--embedder), or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
-    embedder, capture, points = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "capture", "points"))
-    return _Sources(name or None, embedder, capture, points, models.get("embedder"))
 
 
 def _resolve(beside: Path | None, hint: str | None) -> Path | None:
-    """A folder, or a video, from its hint; None if the hint is missing or absolute, or leads to no file."""
+    """A file or folder from its hint; None if the hint is missing or absolute, or leads nowhere."""
     if beside is None or not hint or PurePosixPath(hint).is_absolute() or PureWindowsPath(hint).anchor:
         return None
     folder = os.path.normpath(os.path.join(beside, hint))
