@@ -10,6 +10,7 @@ import hashlib
 import math
 import mmap
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -26,15 +27,8 @@ _DTYPES = {"tensor(float)": "float32", "tensor(double)": "float64"} | {
 }
 _MAX_INPUT_NUMBERS = 1 << 26
 """size of an input; an image of 4096 x 4096 px has 2^25.6 numbers"""
-_MESSAGES = {
-    ("model", 7): "graph",
-    ("graph", 1): "node",
-    ("graph", 5): "tensor",
-    ("node", 5): "attribute",
-    ("attribute", 5): "tensor",
-    ("attribute", 6): "graph",
-}
-"""messages of onnx.proto that lead to constants, by their place: the message around them and their field"""
+_HALF_CONSTANT = re.compile(rb"\x08.{1,3}\x10\x0a\x42.[ -~]{2}", re.DOTALL)
+"""bytes of a constant of half precision in a file of onnx.proto: its last size, its data type FLOAT16 and its name"""
 Shape = Sequence[int | str | None]
 """sizes of the axes: a number if it is fixed, the name of a symbol or None if it is free"""
 
@@ -191,35 +185,9 @@ def content_digest(graphs: Sequence[Path], files: Sequence[Path] = (), *, extra:
 
 
 def _has_half_precision(path: Path) -> bool:
-    """Returns whether a constant of a whole graph is of half precision. Skips the numbers of the constants."""
+    """Returns whether a constant of a whole graph is of half precision."""
     with open(path, "rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-
-        def varint(at: int) -> tuple[int, int]:
-            value = shift = 0
-            while True:
-                byte = data[at]
-                value |= (byte & 127) << shift
-                at, shift = at + 1, shift + 7
-                if byte < 128:
-                    return value, at
-
-        def has_half(message: str, at: int, end: int) -> bool:
-            while at < end:
-                tag, at = varint(at)
-                field, kind = tag >> 3, tag & 7
-                if kind == 0:
-                    value, at = varint(at)
-                    if (message, field, value) == ("tensor", 2, 10):  # its data type is FLOAT16
-                        return True
-                    continue
-                size, at = varint(at) if kind == 2 else ({1: 8, 5: 4}[kind], at)
-                inner = _MESSAGES.get((message, field))
-                if inner is not None and has_half(inner, at, at + size):
-                    return True
-                at += size
-            return False
-
-        return has_half("model", 0, len(data))
+        return _HALF_CONSTANT.search(data) is not None
 
 
 def _check_bytes(path: Path) -> None:
