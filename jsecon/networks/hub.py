@@ -91,19 +91,13 @@ class HubModel:
     @property
     def cached_folder(self) -> Path | None:
         """Folder of its files in the hub's cache, looked up without a request; None if one of them is not there."""
-        from huggingface_hub import snapshot_download
-        from huggingface_hub.errors import LocalEntryNotFoundError
+        from huggingface_hub import try_to_load_from_cache
 
-        for required, optional in _LAYOUTS[self.role]:
-            patterns = [*required, *optional, *(f"{name}_data*" for name in required)]
-            with contextlib.suppress(LocalEntryNotFoundError, ValueError):  # ValueError: no name of a repository
-                folder = Path(
-                    snapshot_download(
-                        self.repository, revision=self.revision, local_files_only=True, allow_patterns=patterns
-                    )
-                )
-                if all((folder / name).is_file() for name in required):
-                    return folder
+        for required, _ in _LAYOUTS[self.role]:
+            with contextlib.suppress(ValueError):  # no name of a repository
+                files = [try_to_load_from_cache(self.repository, name, revision=self.revision) for name in required]
+                if all(isinstance(file, str) for file in files):
+                    return Path(str(files[0])).parents[required[0].count("/")]
         return None
 
 
@@ -136,9 +130,7 @@ def _parse_address(text: str, role: Role) -> HubModel:
     address = re.fullmatch(rf"{PREFIX}([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?", text)
     if address is None:
         raise InputError(text, "not the address of a model", "", "Write hub:owner/name or hub:owner/name@revision.")
-    model = _row_of_repository(role, address[1]) or HubModel(role, address[1])
-    revision = address[2] or "main"
-    return model if revision == model.revision else dataclasses.replace(model, revision=revision, name="")
+    return HubModel(role, address[1], address[2] or "main")
 
 
 def models_of_name(name: str, role: Role | None) -> list[HubModel]:
@@ -158,17 +150,12 @@ def models_of_name(name: str, role: Role | None) -> list[HubModel]:
     raise InputError(repr(name), f"no folder and no known {role or 'model'}", "", remedy)
 
 
-def _row_of_repository(role: Role, repository: str) -> HubModel | None:
-    """Returns the row of the catalogue that a repository has."""
-    return next((row for row in catalogue() if (row.role, row.repository) == (role, repository)), None)
-
-
 def model_name(folder: str | Path, role: Role) -> str:
     """Returns the name of the model of a folder: that of the catalogue, or that of the folder."""
     folder = Path(folder)
     repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
-    row = _row_of_repository(role, repository)
-    return folder.name if row is None else row.name
+    names = (row.name for row in catalogue() if (row.role, row.repository) == (role, repository))
+    return next(names, folder.name)
 
 
 def cached_address(folder: Path) -> str | None:
@@ -241,15 +228,10 @@ def _hub_errors(model: HubModel) -> Iterator[None]:
         cause: BaseException = error
         while isinstance(cause, FileNotFoundError) and cause.__cause__ is not None:  # LocalEntryNotFoundError
             cause = cause.__cause__
-        page, get = f"{constants.ENDPOINT}/{model.repository}", model.get_command
-        match cause:  # in this order: GatedRepoError is a RepositoryNotFoundError
-            case errors.GatedRepoError():
-                problem = "its owner grants access to accounts only"
-                remedy = f"Accept its licence on {page}, set HF_TOKEN to a token of your account, then {get}"
-            case errors.RepositoryNotFoundError() | errors.RevisionNotFoundError():
-                problem = "the hub has no such repository or revision, or it is private"
-                remedy = f"Check {page}; for a private one set HF_TOKEN."
-            case _:
-                problem = f"not fetched from {constants.ENDPOINT} ({describe_error(cause)})"
-                remedy = f"Check the network, the disk and HF_HUB_OFFLINE. Run it again: {get}"
+        problem = f"not fetched from {constants.ENDPOINT} ({describe_error(cause)})"
+        remedy = f"Check the network, the disk and HF_HUB_OFFLINE. Run it again: {model.get_command}"
+        if isinstance(cause, errors.RepositoryNotFoundError | errors.RevisionNotFoundError):  # also GatedRepoError
+            problem = "the hub has no such repository or revision, or grants access to accounts only"
+            page = f"{constants.ENDPOINT}/{model.repository}"
+            remedy = f"Check {page}. Accept its licence there, and set HF_TOKEN to a token of your account."
         raise InputError(model.address, problem, "", remedy) from error

@@ -120,8 +120,7 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
     for stage in stage_list:
         keys[stage.name] = stage.key(keys, context.out)
     paths = {name: context.out / "cache" / f"{name}-{key}.safetensors" for name, key in keys.items()}
-    status = {name: "cached" if path.exists() else "run" for name, path in paths.items()}
-    steps = [Step(stage.name, status[stage.name], stage.how) for stage in stage_list]
+    steps = [Step(stage.name, "cached" if paths[stage.name].exists() else "run", stage.how) for stage in stage_list]
     steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
     return _RunState(keys, paths, steps)
 
