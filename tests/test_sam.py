@@ -13,7 +13,7 @@ from jsecon.networks.hub import find_files
 from jsecon.networks.sam import TOKENS, SamSegmenter, _box_nms, _box_of, _GuidedPrompts, _langsplat_nms, _SamGraphs
 from jsecon.vision.protocols import Segmenter
 
-KINDS = [("sam", 1), ("sam", "batch"), ("sam", 7), ("sam2", "batch")]
+KINDS = [("sam", 1), ("sam", "batch"), ("sam2", "batch")]
 
 
 @pytest.fixture(scope="module")

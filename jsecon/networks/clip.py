@@ -24,12 +24,6 @@ from jsecon.numerics import is_finite_and_bounded
 from jsecon.vision.protocols import CANONICAL
 from jsecon.vision.unrelated_words import cached_unrelated_words
 
-_OUTPUTS = {
-    "image": ("embedding", "image_embeds", "image_features", "image_embedding"),
-    "text": ("embedding", "text_embeds", "text_features", "text_embedding"),
-}
-"""kind of graph -> the names that its output may have; the first that is there is taken"""
-
 
 def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
     """Reads how a model takes images, or raises InputError.
@@ -114,7 +108,7 @@ class ClipEmbedder:
     @functools.cached_property
     def canonical_phrases(self) -> Float32[np.ndarray, "c e"]:
         """(C, E) unit embeddings of CANONICAL."""
-        return self._embed_phrases(list(CANONICAL))
+        return self.embed_text(list(CANONICAL))
 
     @functools.cached_property
     def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
@@ -142,12 +136,28 @@ class ClipEmbedder:
         for text in texts:
             if not text.strip():
                 raise InputError("text", repr(text), "a text", 'Say what to find, for example "red mug".')
-        return self._embed_phrases(texts)
+        graph, what = self._textual, "CLIP's graph of texts with its projection"
+        output = self._output(graph, "text")
+        masks = [name for name in graph.inputs if "mask" in name]
+        names = [name for name in graph.inputs if name not in masks]
+        tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
+        length = tensor.fixed(1) or (CLIP_LENGTH if self._rules is None else self._rules.length)
+
+        def feed(part: np.ndarray) -> dict[str, np.ndarray]:
+            return {tensor.name: part[:, 0]} | {name: part[:, 1] for name in masks}
+
+        tokens = np.stack(self._tokenizer(texts, length), axis=1)
+        rows = _run_in_batches(graph, tokens, tensor.fixed(0), feed, output.name)
+        if rows.shape[1] != self.dim:
+            expected = f"{self.dim}, like the images of {self._visual_path.name}"
+            remedy = "Take both graphs from one model, with their projections."
+            raise InputError(self._textual_path, f"texts of {rows.shape[1]} numbers", expected, remedy)
+        return _normalize(rows, self._textual_path)
 
     def check(self) -> None:
         """Runs the graphs on a black image and a word, and closes them."""
         self._run_visual(self._black_image())
-        self._embed_phrases(["word"])
+        self.embed_text(["word"])
         self.close()
 
     def close(self) -> None:
@@ -180,8 +190,8 @@ class ClipEmbedder:
 
         SigLIP's pooler is the last step and includes the projection; CLIP's lies before it.
         """
-        names = _OUTPUTS[kind] if self._rules is None else (*_OUTPUTS[kind], "pooler_output")
-        name = next((name for name in names if name in graph.outputs), names[0])
+        names = [name for name in graph.outputs if "embed" in name or (self._rules and name == "pooler_output")]
+        name = names[0] if names else "embedding"
         return graph.require("output", name, (None, None), f"CLIP's graph of {kind}s with its projection")
 
     def _run_visual(self, crops: UInt8[np.ndarray, "b s s 3"]) -> np.ndarray:
@@ -193,26 +203,6 @@ class ClipEmbedder:
             return {tensor.name: ((part.astype(np.float32) / 255.0 - mean) / std).transpose(0, 3, 1, 2)}
 
         return _run_in_batches(self._visual, crops, tensor.fixed(0), feed, output.name)
-
-    def _embed_phrases(self, phrases: list[str]) -> Float32[np.ndarray, "p e"]:
-        """(P, E) unit embeddings of phrases as they are."""
-        graph, what = self._textual, "CLIP's graph of texts with its projection"
-        output = self._output(graph, "text")
-        masks = [name for name in graph.inputs if "mask" in name]
-        names = [name for name in graph.inputs if name not in masks]
-        tensor = graph.require("input", names[0] if len(names) == 1 else "input_ids", (None, None), what)
-        length = tensor.fixed(1) or (CLIP_LENGTH if self._rules is None else self._rules.length)
-
-        def feed(part: np.ndarray) -> dict[str, np.ndarray]:
-            return {tensor.name: part[:, 0]} | {name: part[:, 1] for name in masks}
-
-        tokens = np.stack(self._tokenizer(phrases, length), axis=1)
-        rows = _run_in_batches(graph, tokens, tensor.fixed(0), feed, output.name)
-        if rows.shape[1] != self.dim:
-            expected = f"{self.dim}, like the images of {self._visual_path.name}"
-            remedy = "Take both graphs from one model, with their projections."
-            raise InputError(self._textual_path, f"texts of {rows.shape[1]} numbers", expected, remedy)
-        return _normalize(rows, self._textual_path)
 
 
 def _run_in_batches(

@@ -75,13 +75,12 @@ class _SamGraphs:
         inputs = self._decoder.inputs
         self.stretched = "image_embeddings.0" in inputs
         what = "SAM's mask decoder"
-        points = self._decoder.require("input", "input_points", (1, None, None, 2), what)
+        self._decoder.require("input", "input_points", (1, None, None, 2), what)
         self._decoder.require("input", "input_labels", (1, None, None), what)
         self._decoder.require("output", "iou_scores", (1, None, None), what)
         masks = self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
         if masks.fixed(2) not in (None, 3, 4):
             raise self._not_three_masks(str(masks))
-        self._prompts = points.fixed(1) or 1  # of a run; the same one if the graph fixes more
         self.side = image.fixed(3) or side or 1024
         self._links = [name for name in inputs if name not in ("input_points", "input_labels", "input_boxes")]
         for name in self._links:
@@ -117,8 +116,8 @@ class _SamGraphs:
         """
         scaled = point * np.divide(encoded.scaled[::-1], encoded.size[::-1], dtype=np.float32)
         feeds = dict(encoded.features)
-        feeds["input_points"] = np.broadcast_to(scaled, (1, self._prompts, 1, 2))
-        feeds["input_labels"] = np.ones((1, self._prompts, 1), np.int64)
+        feeds["input_points"] = scaled.reshape(1, 1, 1, 2)
+        feeds["input_labels"] = np.ones((1, 1, 1), np.int64)
         if "input_boxes" in self._decoder.inputs:
             feeds["input_boxes"] = np.zeros((1, 0, 4), np.float32)
         outputs = self._decoder.run(feeds, ["pred_masks", "iou_scores"])

@@ -81,12 +81,6 @@ def _plan_labels(context: RunContext) -> Stage:
         how += ", followed through the Gaussians"
     else:
         how += f", followed by {model_name(options.tracker, 'tracker')}"
-    if _chooses_frames(context):
-        how += ", in the frames that show most of the scene"
-    if options.vision_frames is not None:
-        how += f", in at most {options.vision_frames} frames"
-    if options.vision_minutes is not None:
-        how += f", for {options.vision_minutes:g} minutes"
     key_options["tracker"] = options.tracker if models.tracker is None else models.tracker.name
     after, files = ("load", "gaussians"), (options.proposals,)
     return Stage("objects", how, _find_objects, after, key_options, files, distributed=options.tracker is None)

@@ -145,30 +145,21 @@ def _require_inputs(options: Options) -> None:
 def _require_options_apply(options: Options) -> None:
     """Raises InputError if an option is set that the input has no use for."""
     bare = is_bare_scene(options.capture)
+    kind = "a scene without photographs" if bare else "a capture, which has its own views"
     defaults = {field.name: field.default for field in dataclasses.fields(options)}
-    for name in ("frames", "holdout", "refine", "ignore") if bare else ("views", "cameras"):
+    for name in ("frames", "holdout", "refine", "ignore", "gaussians", "points") if bare else ("views", "cameras"):
         if getattr(options, name) != defaults[name]:
-            kind = "a scene without photographs" if bare else "a capture, which has its own views"
-            remedy = "--views sets the number of views." if bare else "--frames sets the most."
-            flag = f"--{name.replace('_', '-')}"
-            raise InputError(flag, f"{options.capture.name} is {kind}", remedy=f"Leave it out; {remedy}")
-    for name in ("gaussians", "points"):
-        if bare and getattr(options, name) is not None:
-            problem = f"{options.capture.name} is a scene of Gaussians or points itself"
-            raise InputError(f"--{name}", problem, "", f"Leave out --{name}, or give the folder of the photographs.")
+            remedy = "Leave it out, or give the folder of the photographs." if bare else "Leave it out."
+            raise InputError(f"--{name}", f"{options.capture.name} is {kind}", remedy=remedy)
 
 
 def _require_own_folder(options: Options, out: Path) -> None:
     """Raises InputError if the output folder is an input folder, or a folder of the capture's files."""
-    capture = options.capture
-    inputs = {name: [value] for name, value in vars(options).items() if isinstance(value, Path)}
-    inputs["capture"] = [capture, *(capture / name for name in ("images", "sparse", "sparse/0", "keyframes"))]
-    for name, folders in inputs.items():
-        for folder in folders:
-            if folder.is_dir() and folder.resolve() == out.resolve():
-                problem = f"it is the input folder ({name}) and the output folder at once"
-                remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
-                raise InputError(out, problem, "", remedy)
+    inputs = [value for value in vars(options).values() if isinstance(value, Path)]
+    inputs += [options.capture / name for name in ("images", "sparse", "sparse/0", "keyframes")]
+    if any(folder.is_dir() and folder.resolve() == out.resolve() for folder in inputs):
+        remedy = f"Give the output its own folder, for example {out / 'field'}, or one elsewhere."
+        raise InputError(out, "it is an input folder and the output folder at once", "", remedy)
 
 
 def _compute_stages(

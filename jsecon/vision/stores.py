@@ -1,19 +1,33 @@
-"""A cache on disk of the masks of frames, by content. Host code.
+"""A cache on disk of what networks compute, by content. Host code.
 
-    FOLDER/<digest of model, settings and frame>.safetensors      bits (M, ceil(H W / 8)) uint8
+    FOLDER/<digest of model, settings and frame>.safetensors      masks of a frame, bits (M, ceil(H W / 8)) uint8
 
 A run that was stopped computes only what is missing: SAM takes minutes per frame on a CPU. A file that cannot be read
 is computed again.
 """
 
+import contextlib
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from jsecon.errors import InputError
 from jsecon.files import READ_ERRORS, atomic_write, read_arrays, write_arrays
+
+
+def stored_array(path: Path, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """Reads an array from a file, or computes and stores it."""
+    with contextlib.suppress(*READ_ERRORS):
+        return read_arrays(path)[1]["array"]
+    array = compute()
+    # A full disk costs the next run minutes, and is no reason to end this one.
+    with contextlib.suppress(InputError), atomic_write(path) as temporary:
+        write_arrays(temporary, {"array": array})
+    return array
 
 
 class StoredSegmenter:
@@ -29,14 +43,10 @@ class StoredSegmenter:
         height, width = frame.shape[:2]
         digest = hashlib.blake2b(f"{self.name} {frame.shape}".encode(), digest_size=16)
         digest.update(np.ascontiguousarray(frame).data)
-        path = self._folder / f"{digest.hexdigest()}.safetensors"
-        try:
-            bits = read_arrays(path)[1]["bits"]
-            if bits.shape[1] != -(-height * width // 8):
-                raise ValueError(f"{bits.shape[1]} bytes a mask")
-            return np.unpackbits(bits, axis=1, count=height * width).reshape(-1, height, width).astype(bool)
-        except READ_ERRORS:
+
+        def packed() -> np.ndarray:
             masks = np.asarray(self._segmenter(frame, index), bool)
-        with atomic_write(path) as temporary:
-            write_arrays(temporary, {"bits": np.packbits(masks.reshape(len(masks), height * width), axis=1)})
-        return masks
+            return np.packbits(masks.reshape(len(masks), height * width), axis=1)
+
+        bits = stored_array(self._folder / f"{digest.hexdigest()}.safetensors", packed)
+        return np.unpackbits(bits, axis=1, count=height * width).reshape(-1, height, width).astype(bool)

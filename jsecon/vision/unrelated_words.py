@@ -4,7 +4,6 @@ Few of them are in any one scene. So their best regions say how similar a text i
 it names (jsecon.query.match). The list was written before anything was measured with it.
 """
 
-import contextlib
 import hashlib
 import os
 from collections.abc import Callable
@@ -14,9 +13,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from jsecon.errors import InputError
-from jsecon.files import READ_ERRORS, atomic_write, read_arrays, write_arrays
 from jsecon.process import cache_home
 from jsecon.vision.protocols import Embedder
+from jsecon.vision.stores import stored_array
 
 UNRELATED_WORDS: tuple[str, ...] = tuple(
     word.strip() for word in Path(__file__).with_name("unrelated_words.txt").read_text().split(",")
@@ -43,10 +42,4 @@ def cached_unrelated_words(
         return embed_text(list(UNRELATED_WORDS))
     digest = hashlib.blake2b(repr((space, UNRELATED_WORDS)).encode(), digest_size=12).hexdigest()
     path = home / "jsecon" / f"words-{digest}.safetensors"
-    with contextlib.suppress(*READ_ERRORS):
-        return read_arrays(path)[1]["rows"]
-    rows = embed_text(list(UNRELATED_WORDS))
-    # A full disk costs the next run a minute, and is no reason to end this one.
-    with contextlib.suppress(InputError), atomic_write(path) as temporary:
-        write_arrays(temporary, {"rows": rows})
-    return rows
+    return stored_array(path, lambda: embed_text(list(UNRELATED_WORDS)))
