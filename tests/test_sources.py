@@ -28,15 +28,15 @@ def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, t
     assert hints == {"points": "../../scan.las", "embedder": "../../models/clip"}
     own = told(field, folders=hints)
     save_field(out / "field.safetensors", own)
-    assert locate_sources(load_field(out / "field.safetensors")) == (model, "", scan)
-    assert locate_sources(own) == (None, "", None)  # of a field that no file was read of
+    assert locate_sources(load_field(out / "field.safetensors")) == (model, None, scan)
+    assert locate_sources(own) == (None, None, None)  # of a field that no file was read of
 
 
 def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path):
     for hint in ("/etc", "//host/share", "C:\\models", "C:models", "\\\\host\\share", "a\0b", "x" * 9000):
         own = told(field, folders={"points": hint, "embedder": hint}, options={"embedder": hint})
         save_field(tmp_path / "field.safetensors", own)
-        assert locate_sources(load_field(tmp_path / "field.safetensors")) == (None, "", None)
+        assert locate_sources(load_field(tmp_path / "field.safetensors")) == (None, None, None)
 
 
 def test_a_model_of_another_name_is_not_opened(field, tmp_path):

@@ -28,8 +28,8 @@ class _Sources(NamedTuple):
 
     model: Path | None
     """folder of the model of the run, if that still exists"""
-    address: str
-    """where the model is on the hub ("hub:owner/name@commit"); empty if the run did not take it from there"""
+    address: str | None
+    """where the model is on the hub ("hub:owner/name@commit"), if the run took it from there"""
     points: Path | None
     """file of the points or Gaussians that the run was given, if that still exists"""
 
@@ -87,7 +87,8 @@ def locate_sources(field: LanguageField) -> _Sources:
         origin = parse_json(field.provenance or "{}")
         folders, models = (origin.get(name, {}) for name in ("folders", "models"))
         model, points = (_resolve(beside, folders.get(kind)) for kind in ("embedder", "points"))
-        return _Sources(model, str(models.get("embedder", "")), points)
+        address = models.get("embedder")
+        return _Sources(model, None if address is None else str(address), points)
     except (ValueError, TypeError, AttributeError) as error:
         remedy = "Give the model yourself (--embedder), or run the capture again."
         raise InputError("field", "its provenance is not what jsecon run writes", remedy=remedy) from error
