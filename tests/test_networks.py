@@ -21,7 +21,6 @@ from jsecon.networks.sam import SamSegmenter
 from jsecon.pipeline import model_loading, run as pipeline
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.stages import RunContext
-from jsecon.vision.stores import StoredSegmenter
 
 
 @pytest.fixture(scope="module")
@@ -160,9 +159,10 @@ def test_query_finds_the_model_by_itself_or_says_what_it_needs(seen, models, tmp
 def test_proposals_are_kept_by_content(models, tmp_path):
     frame = np.zeros((60, 80, 3), np.uint8)
     frame[10:40, 10:50] = (200, 30, 30)
-    stored, failing = (StoredSegmenter(SamSegmenter(models[0]), tmp_path) for _ in range(2))
+    stored, failing = (SamSegmenter(models[0], store=tmp_path) for _ in range(2))
     masks = stored(frame, 0)
-    failing._segmenter = None  # whatever is asked of it now must come from disk
+    np.testing.assert_array_equal(masks, SamSegmenter(models[0])(frame, 0))
+    failing.prompts = None  # whatever is asked of it now must come from disk
     np.testing.assert_array_equal(failing(frame, 5), masks)
     with pytest.raises(TypeError):
         failing(255 - frame, 0)

@@ -60,9 +60,8 @@ def _open(verb: verbs.Clean, console: Console, progress: Progress) -> tuple[Gaus
             console.note(note)
         return bare.scene, bare.views.cameras, None
     capture = load_capture(verb.capture, long_side=Options.long_side, progress=progress)
-    placed, notes = place_in_capture(read_scene(verb.scene)[0], capture, verb.scene, None, progress)
-    for note in notes:
-        console.note(note)
+    placed, note = place_in_capture(read_scene(verb.scene)[0], capture, verb.scene, None, progress)
+    console.note(note)
     return placed, capture.cameras, capture
 
 

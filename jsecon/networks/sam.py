@@ -32,6 +32,7 @@ from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, content_digest
 from jsecon.process import VIEWS_AT_ONCE, cores
 from jsecon.vision.classical import ClassicalSegmenter
+from jsecon.vision.stores import stored_masks
 
 _BOX_IOU = 0.7
 """boxes with a higher IoU repeat each other; this and the thresholds in the code are LangSplat's (preprocess.py)"""
@@ -75,8 +76,6 @@ class _SamGraphs:
         inputs = self._decoder.inputs
         self.stretched = "image_embeddings.0" in inputs
         what = "SAM's mask decoder"
-        self._decoder.require("input", "input_points", (1, None, None, 2), what)
-        self._decoder.require("input", "input_labels", (1, None, None), what)
         self._decoder.require("output", "iou_scores", (1, None, None), what)
         masks = self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
         if masks.fixed(2) not in (None, 3, 4):
@@ -215,6 +214,7 @@ class SamSegmenter:
     Args:
       folder: The model folder.
       level: Level of the masks.
+      store: Folder that keeps the masks of frames, so that a stopped run goes on; None keeps none.
 
     Attributes:
       name: Follows from the content of the files and the level.
@@ -223,7 +223,10 @@ class SamSegmenter:
     prompts: Any = _GuidedPrompts
     """chooses the points: made from a frame and the number of levels, it has `next_points` and `explain`"""
 
-    def __init__(self, folder: str | Path, *, level: Level = "l"):
+    _store: Path | None = None  # of a subclass without files
+
+    def __init__(self, folder: str | Path, *, level: Level = "l", store: Path | None = None):
+        self._store = store
         self._files = find_files(folder, "segmenter")
         encoder, decoder, config = self._files
         self._level = level
@@ -232,7 +235,9 @@ class SamSegmenter:
 
     def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
         """Returns the masks (M, H, W) of a frame, best score first; they may overlap."""
-        return self._segment(frame)[0]
+        if self._store is None:
+            return self._segment(frame)[0]
+        return stored_masks(self._store, self.name, frame, lambda: self._segment(frame)[0])
 
     def _segment(
         self, frame: UInt8[np.ndarray, "h w 3"]

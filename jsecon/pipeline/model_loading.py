@@ -16,7 +16,6 @@ from jsecon.pipeline.options import GEOMETRIC, Options
 from jsecon.pipeline.sources import locate_sources
 from jsecon.types import LanguageField
 from jsecon.vision.protocols import Embedder, Models
-from jsecon.vision.stores import StoredSegmenter
 
 
 def _local_folders(models: Mapping[Role, HubModel | Path]) -> dict[Role, Path]:
@@ -50,8 +49,7 @@ def open_models(options: Options, store: Path) -> Models:
     if options.segmenter is not None:
         from jsecon.networks.sam import SamSegmenter
 
-        sam = SamSegmenter(Path(options.segmenter), level=options.level)
-        segmenter = StoredSegmenter(sam, store / "proposals")
+        segmenter = SamSegmenter(Path(options.segmenter), level=options.level, store=store / "proposals")
     if options.tracker not in (None, GEOMETRIC):
         from jsecon.networks.sam2 import Sam2Tracker
 

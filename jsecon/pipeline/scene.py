@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, join_first
 from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.ignoring import ignore_named
@@ -94,10 +94,8 @@ def _plan_load(context: RunContext, capture: Path | None) -> Stage:
     """
     options = context.options
     key_options = context.key_options("long_side", "frames", "holdout")
-    count = "all frames" if options.frames is None else f"at most {options.frames} frames"
-    held_out = f"1 in {options.holdout} held out" if options.holdout else "none held out"
-    held_out = "the capture's own split or 1 in 8 held out" if options.holdout is None else held_out
-    how = f"{count}, long side at most {options.long_side} px, {held_out}"
+    how = f"frames, long side at most {options.long_side} px"
+    how += ", held out by the capture's own split or 1 in 8" * (options.holdout is None)
     refine = _refinement(options, capture)
     if refine != "never":
         key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
@@ -237,9 +235,9 @@ def _read_gaussians_of_capture(stage: StageInput) -> StageResult:
     scene, read_notes = read_scene(path)
     transform = _near(path, _TRAINED)
     trained = None if transform is None else source_from_trained(transform)
-    placed, notes = place_in_capture(scene, capture, path, trained, stage.progress)
+    placed, note = place_in_capture(scene, capture, path, trained, stage.progress)
     check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
-    return StageResult(placed, notes=(*notes, *read_notes))
+    return StageResult(placed, notes=(note, *read_notes))
 
 
 def _fit_scene(stage: StageInput) -> StageResult:
@@ -282,9 +280,8 @@ def _measure_held_out(stage: StageInput) -> StageResult:
     weak = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
     notes = ()
     if len(weak):
-        names = ", ".join(f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak[:5])
-        more = f" and {len(weak) - 5} more" if len(weak) > 5 else ""
-        note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}{more}; a wrong pose, or "
+        names = join_first([f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak])
+        note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}; a wrong pose, or "
         notes = (note + "something moved: leave them out if the scene is blurred there",)
     return StageResult(measure(), notes=notes)
 

@@ -23,7 +23,7 @@ from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.numerics import FRUSTUM_MARGIN, NEAR
 from jsecon.pipeline.stages import WARNING
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
-from jsecon.read.splats.files import MAX_READ_ROUNDING, read_gaussians
+from jsecon.read.splats.files import read_gaussians
 from jsecon.read.splats.points import gaussians_of_cloud
 from jsecon.splat.render import render_depth, render_rgb
 from jsecon.splat.sh import C0
@@ -72,8 +72,8 @@ class _Placement(NamedTuple):
 
 def place_in_capture(
     gaussians: Gaussians, capture: Capture, path: Path, trained: np.ndarray | None, progress: Progress
-) -> tuple[Gaussians, tuple[str, ...]]:
-    """Moves a file's Gaussians into the world of the capture's cameras.
+) -> tuple[Gaussians, str]:
+    """Moves a file's Gaussians into the world of the capture's cameras, and notes which world the file was in.
 
     A few frames are rendered in each world that the file may be in: the one that `trained` leads back from, that of the
     capture's files, and that of its poses; if none shows the frames well, those of known training programs. The first
@@ -121,18 +121,7 @@ def place_in_capture(
             f"another world than the poses, and answers will be wrong. Give Gaussians in the world of the capture, or "
             f"put the dataparser_transforms.json of their training beside {path.name}."
         )
-    return best.gaussians, (note, *_rounding_note(gaussians, path))
-
-
-def _rounding_note(gaussians: Gaussians, path: Path) -> tuple[str, ...]:
-    """A warning if a file's float32 has rounded the positions of its Gaussians, which cannot be undone."""
-    if gaussians.means.dtype != np.float32:
-        return ()
-    steps = np.spacing(np.abs(gaussians.means).max(axis=1))
-    if np.median(steps / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))) < 2 * MAX_READ_ROUNDING:
-        return ()
-    note = f"{path.name} holds positions in float32, which rounds them to {np.median(steps):.2g} units out there."
-    return (f"{WARNING}{note} Export them in double precision, or nearer to the origin.",)
+    return best.gaussians, note
 
 
 def fit_background(gaussians: Gaussians, capture: Capture) -> Float[np.ndarray, " 3"] | None:

@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -30,23 +29,13 @@ def stored_array(path: Path, compute: Callable[[], np.ndarray]) -> np.ndarray:
     return array
 
 
-class StoredSegmenter:
-    """Segmenter with a network (`jsecon.vision.protocols.Models`), and a cache on disk by its name."""
-
-    def __init__(self, segmenter: Any, folder: Path):
-        self.name = segmenter.name
-        self.check, self.close = segmenter.check, segmenter.close
-        self._segmenter, self._folder = segmenter, folder
-
-    def __call__(self, frame: UInt8[np.ndarray, "h w 3"], index: int) -> Bool[np.ndarray, "m h w"]:
-        """Returns the masks of the segmenter for a frame, from the cache if they are there."""
-        height, width = frame.shape[:2]
-        digest = hashlib.blake2b(f"{self.name} {frame.shape}".encode(), digest_size=16)
-        digest.update(np.ascontiguousarray(frame).data)
-
-        def packed() -> np.ndarray:
-            masks = np.asarray(self._segmenter(frame, index), bool)
-            return np.packbits(masks.reshape(len(masks), height * width), axis=1)
-
-        bits = stored_array(self._folder / f"{digest.hexdigest()}.safetensors", packed)
-        return np.unpackbits(bits, axis=1, count=height * width).reshape(-1, height, width).astype(bool)
+def stored_masks(
+    folder: Path, name: str, frame: UInt8[np.ndarray, "h w 3"], segment: Callable[[], Bool[np.ndarray, "m h w"]]
+) -> Bool[np.ndarray, "m h w"]:
+    """Reads the masks that the segmenter of a name finds in a frame, or finds and stores them."""
+    height, width = frame.shape[:2]
+    digest = hashlib.blake2b(f"{name} {frame.shape}".encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(frame).data)
+    path = folder / f"{digest.hexdigest()}.safetensors"
+    bits = stored_array(path, lambda: np.packbits(segment().reshape(-1, height * width), axis=1))
+    return np.unpackbits(bits, axis=1, count=height * width).reshape(-1, height, width).astype(bool)
