@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from jsecon.process import peak_memory_mib, prepare_process
+from jsecon.process import compilation_counts, peak_memory_mib, prepare_process
 
 KEPT = "load", "gaussians"
 """stages of the cold run that the warm one finds in the cache"""
@@ -31,10 +31,11 @@ def measure(capture: Path, out: Path, steps: int) -> None:
     from jsecon.pipeline import run as pipeline
     from jsecon.pipeline.options import Options
 
+    compilation_counts()  # counts from here on
     run = pipeline.run(Options(capture, steps=steps), out)
     figures = {
         "seconds": run.seconds,
-        "programs": run.programs,
+        "programs": compilation_counts(),
         "peak_mib": peak_memory_mib(),
         "psnr": float(np.mean(run.held_out.psnr)),
         "gaussians": run.field.gaussians.count,

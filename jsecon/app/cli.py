@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             result = {"error": InputError("", "interrupted", remedy=remedy)}
             return _finish(as_json, result, 130)
         if is_out_of_memory(error):
-            remedy = "End other programs, or take a machine with more memory."
+            remedy = "End other programs, run with smaller or fewer frames (--long-side, --frames), or add memory."
             error = InputError("", f"memory has no room left ({str(error)[:200]})", remedy=remedy)
         error = machine_error(error, "") or error
         if isinstance(error, InputError):

@@ -88,15 +88,13 @@ def write_run(
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
         "skipped": {step.name: step.why for step in run.steps if step.status == "skipped"},
         "notes": list(run.notes),
-        "programs_compiled": run.programs,
         "peak_memory_mib": round(peak_memory_mib(), 1),
         **figures,
     }
     write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     summary = (
         f"{metrics['gaussians']} Gaussians, {metrics['regions']} regions, "
-        f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB, "
-        f"{run.programs['all']} programs compiled ({run.programs['from_disk']} of them read from disk)"
+        f"{sum(run.seconds.values()):.0f} s, peak memory {metrics['peak_memory_mib']:.0f} MiB"
     )
     warnings = [note for note in run.notes if note.startswith(WARNING)]
     with console.progress("report"):

@@ -77,20 +77,13 @@ class _SamGraphs:
         self.stretched = "image_embeddings.0" in inputs
         what = "SAM's mask decoder"
         self._decoder.require("output", "iou_scores", (1, None, None), what)
-        masks = self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
-        if masks.fixed(2) not in (None, 3, 4):
-            raise self._not_three_masks(str(masks))
+        self._decoder.require("output", "pred_masks", (1, None, None, None, None), what)
         self.side = image.fixed(3) or side or 1024
         self._links = [name for name in inputs if name not in ("input_points", "input_labels", "input_boxes")]
         for name in self._links:
             what = f"the encoder that {decoder.name} belongs to"
             self._encoder.require("output", name, inputs[name].shape or (), what)
         self._mean, self._std = 255 * np.asarray((mean, std), np.float32)
-
-    def _not_three_masks(self, problem: str) -> InputError:
-        expected = "3 or 4 masks per prompt, from the smallest part to the whole, each with its score"
-        where = f"{self._decoder.path}, output 'pred_masks'"
-        return InputError(where, problem, expected, "Export the decoder with all of its masks.")
 
     def encode(self, frame: UInt8[np.ndarray, "h w 3"]) -> _EncodedFrame:
         """Encodes an RGB frame for `decode`.
@@ -122,7 +115,9 @@ class _SamGraphs:
         outputs = self._decoder.run(feeds, ["pred_masks", "iou_scores"])
         masks, scores = outputs["pred_masks"][0, 0], outputs["iou_scores"][0, 0]
         if len(masks) != len(scores) or len(masks) not in (3, 4):
-            raise self._not_three_masks(f"{list(masks.shape)} with scores {list(scores.shape)}")
+            where, problem = f"{self._decoder.path}, output 'pred_masks'", f"{len(masks)} masks, {len(scores)} scores"
+            expected = "3 or 4 masks per prompt, from the smallest part to the whole, each with its score"
+            raise InputError(where, problem, expected, "Export the decoder with all of its masks.")
         return masks[-3:].astype(np.float32), scores[-3:].astype(np.float32)
 
     def to_frame(self, logits: Float32[np.ndarray, "l l"], encoded: _EncodedFrame) -> Float32[np.ndarray, "h w"]:

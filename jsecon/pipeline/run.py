@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from jsecon.backend import start_backend
-from jsecon.errors import InputError, is_out_of_memory
+from jsecon.errors import InputError
 from jsecon.field.field import load_field
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.field.ledger_file import save_with_ledger
@@ -41,7 +41,6 @@ from jsecon.pipeline.stages import (
     training_frames,
 )
 from jsecon.poses.sfm import require_pycolmap
-from jsecon.process import compilation_counts
 from jsecon.read.captures.build import plan_frames
 from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
@@ -99,8 +98,6 @@ class Run:
     """Wall time of each stage, also of one that was computed in an earlier run."""
     notes: list[str]
     """What the user should know, a sentence each."""
-    programs: dict[str, int]
-    """Number of programs that jax compiled ("all"), and of those that it read "from_disk"."""
 
 
 def _run_stages(context: RunContext) -> list[Stage]:
@@ -206,14 +203,7 @@ def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console:
         return result
 
     with console.progress(stage.name) as progress:
-        try:
-            result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=console.note)
-        except (MemoryError, jax.errors.JaxRuntimeError) as error:
-            if is_out_of_memory(error):
-                problem = f"no memory left ({str(error)[:200]})"
-                remedy = "Take smaller frames (--long-side), or fewer (--frames). Finished stages are kept."
-                raise InputError(f"stage {stage.name}", problem, "more memory", remedy) from error
-            raise
+        result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=console.note)
     setattr(state.results, stage.name, result.value)
     state.seconds[stage.name] = seconds
     checkpoint.remove()
@@ -257,7 +247,7 @@ def run(
     A run that was stopped resumes where it stopped, to the same result. `on_scene` is called with the capture and the
     scene as soon as both are known.
     """
-    console, before = console or Console(), compilation_counts()
+    console = console or Console()
     context = _open_context(options, out)
     state = _compute_stages(context, _run_stages(context), console, on_scene)
     results, seconds, embedder = state.results, state.seconds, context.models.embedder
@@ -272,9 +262,8 @@ def run(
     if field.up is not None and not field.up.sure:
         state.notes.append(f"up is from {field.up}")
         console.note(state.notes[-1])
-    programs = {name: count - before[name] for name, count in compilation_counts().items()}
     made = results.load, results.objects.labels, results.objects.frames, results.held_out
-    return Run(field, context.options, *made, state.steps, seconds, state.notes, programs)
+    return Run(field, context.options, *made, state.steps, seconds, state.notes)
 
 
 def join_field(results: Results, embedder: Embedder, provenance: str, options: Options) -> LanguageField:

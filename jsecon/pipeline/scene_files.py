@@ -82,17 +82,12 @@ def place_in_capture(
     source_from_scene = np.asarray(capture.source_from_scene, np.float64)
     poses = capture.poses_from_scene
     poses_from_scene = np.eye(4) if poses is None else np.asarray(poses, np.float64)
-    scene_from_source, scene_from_poses = np.linalg.inv(source_from_scene), np.linalg.inv(poses_from_scene)
     size = np.abs(source_from_scene).max()
-    transformed = not np.allclose(poses_from_scene, source_from_scene, rtol=1e-9, atol=1e-9 * size)
-    worlds = {"the capture's files" if transformed else "the capture's poses": scene_from_source}
-    if transformed:
-        worlds["the poses, without the applied_transform undone"] = scene_from_poses
+    worlds = {"the capture's files": np.linalg.inv(source_from_scene)}
+    if not np.allclose(poses_from_scene, source_from_scene, rtol=1e-9, atol=1e-9 * size):
+        worlds["the poses, without the applied_transform undone"] = np.linalg.inv(poses_from_scene)
     if trained is not None:
-        told = {"dataparser_transforms.json": scene_from_source @ trained}
-        if transformed:
-            told["dataparser_transforms.json, of the poses"] = scene_from_poses @ trained
-        worlds = told | worlds
+        worlds = {f"dataparser_transforms.json, of {name}": way @ trained for name, way in worlds.items()} | worlds
     best = None
     for candidates in (list(worlds.items()), _training_worlds(capture, poses_from_scene)):
         if best is not None and best.explained and best.correlation >= 0.9:
