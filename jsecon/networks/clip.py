@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, Tensor, content_digest
@@ -64,11 +64,8 @@ def _masked_crop(
     """Crops a region: black outside of its mask, centred in a black square, resized bilinearly to `size` px.
 
     The crop is SAM's box with LangSplat's extent, largest minus smallest coordinate: the last row and column are cut
-    off unless the region has no other. ValueError is raised if the mask is empty, or has another shape.
+    off unless the region has no other.
     """
-    fits = mask.shape == frame.shape[:2] and bool(mask.any())
-    got = f"{mask.shape}, {int(mask.sum())} pixels"
-    require(fits, "mask", got, f"{frame.shape[:2]}, at least one pixel", "Leave out empty masks.")
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     height, width = max(int(rows[-1] - rows[0]), 1), max(int(columns[-1] - columns[0]), 1)
     box = slice(rows[0], rows[0] + height), slice(columns[0], columns[0] + width)

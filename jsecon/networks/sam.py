@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 from PIL import Image
 from scipy import sparse
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError
 from jsecon.networks.clip import read_preprocessing
 from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, content_digest
@@ -345,7 +345,6 @@ def _langsplat_nms(masks: Bool[np.ndarray, "m h w"], scores: Float[np.ndarray, "
     it) * (share of the other) below 0.5. A mask that is itself dropped still suppresses. Of equal scores the earlier
     counts as better. Empty masks are dropped.
     """
-    require(len(scores) == len(masks), "scores", len(scores), str(len(masks)), "One score per mask.")
     order = np.argsort(-scores, kind="stable")
     rows = sparse.csr_matrix(masks[order].reshape(len(masks), masks.shape[1] * masks.shape[2])).astype(np.int32)
     shared = (rows @ rows.T).toarray().astype(np.float64)  # px that any two masks share

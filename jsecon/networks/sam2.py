@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError
 from jsecon.files import read_json, reading
 from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, content_digest
@@ -128,7 +128,6 @@ class _Sam2Graphs:
             points, labels = prompt
             return self._decode(features, features["feats2_no_mem"], np.asarray(points, np.float32) * scale, labels)
         rows, columns = np.flatnonzero(prompt.any(1)), np.flatnonzero(prompt.any(0))
-        require(len(rows) > 0, "follow", "an empty mask", "at least one pixel", "Leave out empty masks.")
         box = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], np.float32) * scale
         decoded = self._decode(features, features["feats2_no_mem"], box, np.array([2, 3]))
         inside = _resize(prompt.astype(np.float32), side) >= 0.5
@@ -263,8 +262,6 @@ class _Bank:
         pointers = [(abs(t - self.start), self.prompted.pointer)]
         pointers += [(d, memory.pointer) for d, memory in near if d < count]
         memories = [(row, array) for row, array in tokens if array is not None]
-        if len(memories) < len(tokens):
-            raise ValueError(f"frame {t} needs memories that were dropped")
         newest = min(1, len(memories) - 1), min(1, len(pointers) - 1)
         memories += [memories[newest[0]]] * (SLOTS - len(memories))
         pointers += [pointers[newest[1]]] * (POINTERS - len(pointers))
@@ -300,8 +297,6 @@ def follow(
       A frame index and the mask logits (L, L) of each object, for every frame.
     """
     count = len(frames)
-    require(0 <= start < count, "follow", f"frame {start}", f"a frame below {count}", "Prompt a frame of the sequence.")
-    require(len(prompts) > 0, "follow", "no prompt", "at least one", "Prompt an object.")
     features = model.encode(frames[start])
     first = [model._prompted(features, prompt, frames.shape[1:3]) for prompt in prompts]
     memories = [model._memorize(features, prediction, binarize=True) for prediction in first]
