@@ -90,7 +90,7 @@ def test_votes_of_a_scene_larger_than_memory_are_cast_in_blocks_to_the_same_fiel
     monkeypatch.setattr(cache, "MAPPED", 1000)  # what is kept of them is mapped, as were it larger
     _, console = again(run, tmp_path / "out", paper=True)
     assert {name for name, fresh in console.fresh.items() if fresh} == {"votes", "codes", "field"}
-    for words in ("votes is computed again", "votes are kept on disk: "):
+    for words in ("stage votes is computed again", "votes are kept on disk: "):
         assert any(words in note for note in console.notes)
     assert {path.suffix for path in (tmp_path / "out" / "cache").iterdir()} == {".TAG", ".safetensors"}
     blocks, memory = (load_field(folder / "field.safetensors").votes for folder in (tmp_path / "out", out))

@@ -20,13 +20,13 @@ import jax
 import numpy as np
 
 import jsecon
-from jsecon.errors import describe_error
+from jsecon.errors import InputError
 from jsecon.files import (
-    READ_ERRORS,
     atomic_write,
     list_files,
     pack_tree,
     read_arrays,
+    reading,
     unpack_tree,
     write_arrays,
     write_text,
@@ -37,10 +37,6 @@ PACKAGES = ("association", "field", "fit", "networks", "paper", "pipeline", "pos
 """subpackages that stages compute with"""
 MAPPED = 1 << 30
 """bytes; larger arrays are memory-mapped"""
-
-
-class CorruptCacheError(Exception):
-    """A cache file cannot be read, so the stage must be computed again."""
 
 
 def files_digest(paths: Iterable[Path], *, exclude: Path | None = None) -> str:
@@ -97,8 +93,8 @@ def fetch(
     if path.exists():
         try:
             return *load(path), False
-        except CorruptCacheError as error:
-            note(f"{path.name} cannot be read ({error}); {path.stem.partition('-')[0]} is computed again")
+        except InputError as error:
+            note(f"{error} The stage {path.stem.partition('-')[0]} is computed again.")
     started = time.monotonic()
     value = compute()
     jax.block_until_ready(value)
@@ -120,8 +116,6 @@ def save(path: Path, value: Any, seconds: float = 0.0) -> Any:
 
 def load(path: Path) -> tuple[Any, float]:
     """Reads what `save` wrote."""
-    try:
+    with reading(path):
         description, arrays = read_arrays(path, memory_map_above=MAPPED)
         return unpack_tree(description["tree"], arrays), float(description["seconds"])
-    except READ_ERRORS as error:
-        raise CorruptCacheError(describe_error(error)) from error

@@ -136,7 +136,7 @@ class Checkpoint:
 
     def read(self) -> Any | None:
         """Reads the last state."""
-        with contextlib.suppress(cache.CorruptCacheError):
+        with contextlib.suppress(InputError):
             return cache.load(self._path)[0] if self._path.exists() else None
         return None
 
