@@ -108,44 +108,33 @@ def read_text_rules(folder: Path, tokenizer: Path) -> _TextRules | None:
     siglip2, and `text_config`. tokenizer_config.json has `pad_token`, and of transformers `tokenizer_class`.
     InputError is raised if a configuration cannot be read or does not state a rule.
     """
-    path = folder / "config.json"
-    if not path.is_file():
-        return None
-    content = _read_object(path)
+    path, beside = folder / "config.json", tokenizer.with_name("tokenizer_config.json")
+    content = _read_object(path) if path.is_file() else {}
     text = content.get("text_cfg")
-    if isinstance(text, dict) and "hf_tokenizer_name" in text:
+    is_open_clip = isinstance(text, dict) and "hf_tokenizer_name" in text
+    if not is_open_clip and not str(content.get("model_type", "")).startswith("siglip"):
+        return None
+    settings = _read_object(beside)
+    pad = settings.get("pad_token")
+    pad = pad.get("content") if isinstance(pad, dict) else pad  # a token is written with its options, or alone
+    if not isinstance(pad, str):
+        raise InputError(beside, f"pad_token {pad!r}", "the token that pads short texts, which SigLIP reads", _FETCH)
+    if is_open_clip:
         options = text.get("tokenizer_kwargs") or {}
         if not isinstance(options, dict) or set(options) - {"clean"}:
             raise InputError(path, f"tokenizer_kwargs {options}", '{"clean": ...} or {}', "Take another model.")
-        length = text.get("context_length", CLIP_LENGTH)
-        clean = options.get("clean", "whitespace")
-        pad = _read_padding(tokenizer)[0]
-    elif str(content.get("model_type", "")).startswith("siglip"):
-        pad, name = _read_padding(tokenizer)
+        length, clean = text.get("context_length", CLIP_LENGTH), options.get("clean", "whitespace")
+    else:
+        name, text = str(settings.get("tokenizer_class", "")).removesuffix("Fast"), content.get("text_config")
         if name not in _CLEANING_OF_CLASS:
-            where = tokenizer.with_name("tokenizer_config.json")
-            raise InputError(where, f"tokenizer_class {name!r}", " or ".join(_CLEANING_OF_CLASS), _FETCH)
-        text = content.get("text_config")
+            raise InputError(beside, f"tokenizer_class {name!r}", " or ".join(_CLEANING_OF_CLASS), _FETCH)
         # 64 is the default of transformers' SiglipTextConfig.
         length = (text if isinstance(text, dict) else {}).get("max_position_embeddings", 64)
         clean = _CLEANING_OF_CLASS[name]
-    else:
-        return None
     if type(length) is not int or not 2 <= length <= 4096 or clean not in ("canonicalize", "lower", "whitespace"):
         expected = "2 to 4096 tokens, cleaned by canonicalize, lower or whitespace"
         raise InputError(path, f"texts of {length!r} tokens, cleaned by {clean!r}", expected, _FETCH)
     return _TextRules(length, pad, clean)
-
-
-def _read_padding(tokenizer: Path) -> tuple[str, str]:
-    """Reads the padding token and the tokenizer's class from the tokenizer_config.json beside a tokenizer.json."""
-    path = tokenizer.with_name("tokenizer_config.json")
-    content = _read_object(path)
-    pad = content.get("pad_token")
-    pad = pad.get("content") if isinstance(pad, dict) else pad  # a token is written with its options, or alone
-    if not isinstance(pad, str):
-        raise InputError(path, f"pad_token {pad!r}", "the token that pads short texts, which SigLIP reads", _FETCH)
-    return pad, str(content.get("tokenizer_class", "")).removesuffix("Fast")
 
 
 def _read_object(path: Path) -> dict[str, Any]:
