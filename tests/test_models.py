@@ -101,5 +101,5 @@ def test_a_damaged_folder_is_named(tmp_path, model, name, change, words):
     with refused(*([words] if isinstance(words, str) else words)):
         opened = open_model(folder)
         opened.check()
-        if model == "sam":
+        if isinstance(opened, SamSegmenter):
             opened(np.full((16, 16, 3), 99, np.uint8), 0)
