@@ -110,7 +110,7 @@ def read_text_rules(folder: Path, tokenizer: Path) -> _TextRules | None:
     """
     path, beside = folder / "config.json", tokenizer.with_name("tokenizer_config.json")
     content = _read_object(path) if path.is_file() else {}
-    text = content.get("text_cfg")
+    text = content.get("text_cfg") or {}
     is_open_clip = isinstance(text, dict) and "hf_tokenizer_name" in text
     if not is_open_clip and not str(content.get("model_type", "")).startswith("siglip"):
         return None

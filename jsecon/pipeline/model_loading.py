@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from jsecon.errors import InputError
 from jsecon.networks.hub import RECOMMENDED, HubModel, Role, parse_model
@@ -65,7 +65,8 @@ def _open_embedder(folder: str | Path | None) -> Embedder:
         return ColourEmbedder()
     from jsecon.networks.clip import ClipEmbedder
 
-    return ClipEmbedder(_local_folders({"embedder": parse_model(folder, "embedder")})["embedder"])
+    clip: Any = ClipEmbedder(_local_folders({"embedder": parse_model(folder, "embedder")})["embedder"])
+    return clip
 
 
 def field_embedder(field: LanguageField, folder: str | Path | None = None) -> Embedder:
