@@ -17,7 +17,7 @@ from test_pipeline import Recorder
 
 from jsecon import load_capture, load_field, load_gaussians, save_field, save_gaussians
 from jsecon.files import exclusive_lock, reading, write_text
-from jsecon.pipeline import cache, run as pipeline, scene
+from jsecon.pipeline import cache, run as pipeline
 from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures.images import write_image
 
@@ -51,12 +51,6 @@ def capture(tmp_path):
     folder = tmp_path / "Fotos aus Köln 日本 #1 %20"
     write_transforms(small_capture(), folder)
     return folder
-
-
-def test_want_of_memory_names_the_stage_and_what_helps(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(scene, "load_capture", lambda *_, **__: np.ones(1 << 50))
-    with refused("stage load", "Unable to allocate", "--long-side"):
-        pipeline.run(pipeline.Options(capture), tmp_path / "out")
 
 
 def test_an_opencv_without_its_contrib_modules_is_told_before_anything_runs(capture, tmp_path, monkeypatch):

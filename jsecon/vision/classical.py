@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, require
 from jsecon.vision.region_graph import merge_regions
 from jsecon.vision.surfaces import Surface
 
@@ -58,6 +58,8 @@ class ClassicalSegmenter:
 
     def partitions(self, frame: np.ndarray, index: int) -> list[Int32[np.ndarray, "h w"]]:
         """Partitions a frame (H, W, 3) uint8 into connected regions, labels 0 .. M-1 of each layer."""
+        fits = frame.ndim == 3 and frame.shape[2] == 3 and frame.dtype == np.uint8
+        require(fits, "frame", (frame.shape, frame.dtype), "(H, W, 3) uint8", "Pass RGB frames as 8-bit arrays.")
         colour, surface = _colour_features(frame), None if self.surfaces is None else self.surfaces(index)
         turned, seeds = (None, colour) if surface is None else self._with_surface(colour, surface)
         superpixels, least = _oversegment(seeds), self.min_area * frame.shape[0] * frame.shape[1]

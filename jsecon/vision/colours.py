@@ -15,7 +15,7 @@ import numpy as np
 import scipy  # loads scipy.optimize on its first use, which most texts do without
 from jaxtyping import Bool, Float32, UInt8
 
-from jsecon.errors import InputError
+from jsecon.errors import InputError, require_shape
 
 _TABLES = tomllib.loads(Path(__file__).with_name("colours.toml").read_text())
 PALETTE: dict[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLES["palette"].items()}
@@ -93,6 +93,7 @@ class ColourEmbedder:
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]
     ) -> Float32[np.ndarray, "m e"]:
         """Embeds masks of a frame: unit rows, zero for an empty mask."""
+        require_shape("masks", masks, ("M", *frame.shape[:2]), "Pass masks of the size of the frame.")
         lab = cv2.cvtColor(np.ascontiguousarray(frame).astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
 
         out = np.zeros((len(masks), self.dim), np.float32)
