@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError, require, require_shape
 from jsecon.vision.region_graph import merge_regions
 from jsecon.vision.surfaces import Surface
 
@@ -77,6 +77,8 @@ class ClassicalSegmenter:
         Returns (H, W, 3) normals, of which a crease of 50 degrees equals a step of `merge_distance`; and (H, W, 7)
         features for the oversegmentation: colours, normals at half weight, and depth.
         """
+        for array in (surface.points, surface.normals):
+            require_shape("surface", array, colour.shape, "Pass surfaces of the size of the frame.")
         crease = 2.0 * np.sin(np.radians(50.0) / 2.0)
         turned = surface.normals * np.float32(self.merge_distance / crease)
         jump = np.float32(0.5 * self.merge_distance / np.log1p(self.depth_jump))
