@@ -88,14 +88,12 @@ def place(scene: Scene, capture: Path, most: int, scratch: Path) -> tuple[list[t
     for name in held:
         (scratch / files[name].name).symlink_to(files[name].resolve())
     less = scene.forget(held)
-    frames = read_frames(less.field, less.ledger, scratch, None, lambda error: None, lambda done, total: None)
+    placed = read_frames(less.field, less.ledger, scratch, None, lambda error: None, lambda done, total: None)
     centres = np.asarray(field.cameras.centres, np.float64)
     size, errors = 2 * np.linalg.norm(centres - centres.mean(0), axis=1).max(), []
-    for name, frame in frames.items():
+    for name, pose in zip(placed.names, placed.cameras.world_to_camera):
         t = field.names.index(name)
-        found, true = (
-            np.asarray(c, np.float64) for c in (frame.camera.world_to_camera, field.cameras.world_to_camera[t])
-        )
+        found, true = (np.asarray(each, np.float64) for each in (pose, field.cameras.world_to_camera[t]))
         cosine = (np.trace(found[:3, :3] @ true[:3, :3].T) - 1) / 2
         centre = -found[:3, :3].T @ found[:3, 3]
         errors.append((np.degrees(np.arccos(np.clip(cosine, -1, 1))), 100 * np.linalg.norm(centre - centres[t]) / size))

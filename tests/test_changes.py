@@ -17,6 +17,7 @@ from experiments.rooms.writers import write_colmap
 from jsecon import InputError, LanguageField, Regions, Scene, load_field
 from jsecon.app.scene import open_scene
 from jsecon.app.server import application
+from jsecon.change import detect
 from jsecon.change.compare import depth_cost
 from jsecon.change.detect import object_changes
 from jsecon.change.history import events
@@ -208,12 +209,13 @@ def test_the_date_of_photographs_is_the_latest_of_their_exif_data(tmp_path):
     assert taken_on(tmp_path / "2.jpg") is None
 
 
-def test_what_too_little_shows_is_unsure_and_not_applied(eyes):
+def test_what_too_little_shows_is_unsure_and_not_applied(eyes, monkeypatch):
     before, labels = scene_of(red=PLACES["red"], blue=PLACES["blue"])
     frames = photographs(scene_of(red=PLACES["red"])[0], eyes)
     gone = object_changes(before, labels, frames, eyes, up=UP)[1]
-    certain = object_changes(before, labels, frames, eyes, up=UP, min_probability=gone.probability + 0.001)[1]
-    assert (gone.kind, certain.kind, certain.suspected) == ("gone", "unsure", "gone")
+    monkeypatch.setattr(detect, "MIN_PROBABILITY", gone.probability + 0.001)
+    unsure = object_changes(before, labels, frames, eyes, up=UP)[1]
+    assert (gone.kind, unsure.kind, unsure.suspected) == ("gone", "unsure", "gone")
 
 
 def test_frames_with_depth_that_are_added_give_gaussians_to_what_is_new(eyes):

@@ -4,17 +4,12 @@ import dataclasses
 
 import pytest
 from capture_files import context_of, write_transforms
-from test_corrections import (
-    capture as capture,  # fixtures
-    errors,
-    rough,
-    truth as truth,
-)
+from test_alignment import in_a_corner, moved
+from test_corrections import capture as capture, truth as truth  # fixtures
 from test_fit import same
 
 from jsecon.pipeline.run import _compute_stages
 from jsecon.pipeline.scene import plan_capture
-from jsecon.poses import refine
 
 
 def load(folder, out, **options):
@@ -25,14 +20,10 @@ def load(folder, out, **options):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("exact", "says"), [(False, "are corrected"), (True, "stay as they are")])
-def test_by_default_a_rough_capture_with_depth_is_corrected_once(capture, truth, tmp_path, monkeypatch, exact, says):
-    """With frames of one size, and a start of the probes that few views can correct."""
-    monkeypatch.setattr(refine, "FINE_SIZE", 1.0)
-    monkeypatch.setattr(refine, "MIN_ASIDE", 1)
-    monkeypatch.setattr(refine, "starting_gaussians", lambda capture, **_: (truth, ""))
+@pytest.mark.parametrize(("exact", "says"), [(False, "refined by colour and depth"), (True, "stay as they are")])
+def test_by_default_a_rough_capture_with_depth_is_corrected_once(tmp_path, exact, says):
     told = tmp_path / "told"
-    write_transforms(capture if exact else rough(capture, **errors()), told)
+    write_transforms(in_a_corner() if exact else moved(in_a_corner(), 2.0, 1.0), told)
     as_it_is, _, _ = load(told, tmp_path / "none", refine="never")
     found = []
     for status in ("run", "cached"):

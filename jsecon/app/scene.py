@@ -20,11 +20,11 @@ from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.comparison import Changes, add_new_things, apply_changes, find_changes, splat_capture
+from jsecon.app.comparison import Changes, apply_changes, find_changes, new_things, splat_capture
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
-from jsecon.change.history import change_question, events, field_as_of
+from jsecon.change.history import add_unseen, change_question, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
@@ -47,6 +47,7 @@ from jsecon.query.parts import match_lone_parts
 from jsecon.query.pointing import box_mask, frame_index, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
+from jsecon.read.captures.frames import take_frames
 from jsecon.read.splats.files import save_gaussians
 from jsecon.read.splats.points import load_point_cloud, save_point_cloud
 from jsecon.splat.points import nearest_gaussians
@@ -250,20 +251,28 @@ class Scene:
             pose_file, mask_folder = (None if path is None else Path(path) for path in (poses, masks))
             photos = photos if isinstance(photos, Capture) else Path(photos)
             with console.progress("frames") as progress:
-                frames = read_frames(self.field, ledger, photos, pose_file, refuse, progress)
+                capture = read_frames(self.field, ledger, photos, pose_file, refuse, progress)
             with console.progress("views") as progress:
-                views = make_views(self.field, frames, embedder, mask_folder, refuse, progress)
+                views = make_views(self.field, capture, embedder, mask_folder, refuse, progress, {})
                 if not views:
                     raise errors.pop()
-                kept = {name: frames[name] for name in views}
-                field, kept = add_new_things(self.field, lambda: self._catalogue, kept)
-                has_more_rows = field is not self.field
-                if has_more_rows:
-                    views = make_views(field, kept, embedder, mask_folder, refuse, progress)
+                capture = take_frames(capture, [t for t, name in enumerate(capture.names) if name in views])
+                field, masks = self._add_new_things(capture)
+                if masks:
+                    views = make_views(field, capture, embedder, mask_folder, refuse, progress, masks)
             with console.progress("votes"):
-                ledger = Ledger(ledger.num_regions, ledger.views) if has_more_rows else summed.result()
+                ledger = Ledger(ledger.num_regions, ledger.views) if masks else summed.result()
                 field, grown = add_views(field, ledger, views)
                 return self._with(field, lambda: grown)
+
+    def _add_new_things(self, capture: Capture) -> tuple[LanguageField, dict[str, np.ndarray]]:
+        """Gives Gaussians to what frames with depth show and no Gaussian explains; returns its masks by their names."""
+        if capture.depths is None or not capture.depths.any():
+            return self.field, {}
+        shown = take_frames(capture, np.flatnonzero(capture.depths.any(axis=(1, 2))).tolist())
+        things, masks = new_things(find_changes(self.field, self._catalogue, shown), capture.cameras)
+        field = add_unseen(self.field, things) if things else self.field
+        return field, {shown.names[t]: mask for t, mask in masks.items()}
 
     def forget(self, frames: Sequence[int | str]) -> "Scene":
         """Takes frames out: votes, embeddings, poses and pictures, as if they had never been there.

@@ -4,10 +4,9 @@ Pure functions on NumPy arrays. Photographs are compared in the colours of the s
 A pixel may be lighter or darker by a factor, at a small cost, because light and shadows change what nothing moved.
 """
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
+import scipy  # loads scipy.optimize on its first use
 from jaxtyping import Bool, Float, Float32
 
 COLOUR_STEP = 22.0
@@ -26,19 +25,17 @@ def fit_exposure(
     The fit weighs pixels by how well they agree (Cauchy), so that what changed does not count.
     """
     known = known & (photo > 0.01).all(-1) & (photo < 0.99).all(-1)
-    if known.sum() < 64:
+    every = known.sum() // 4000 + 1  # so many pixels are enough
+    source, target = photo[known][::every].astype(np.float64), render[known][::every]
+    if len(source) < 64:
         return photo
-    source, target = photo[known].astype(np.float64), render[known].astype(np.float64)
-    gain, offset = np.median(target, 0) / np.maximum(np.median(source, 0), 1e-3), np.zeros(3)
-    for _ in range(12):
-        error = source * gain + offset - target
-        weight = 1 / (1 + (error**2).sum(1) / 0.04**2)
-        mean, middle = (np.average(values, axis=0, weights=weight) for values in (source, target))
-        spread = np.average((source - mean) ** 2, axis=0, weights=weight)
-        both = np.average((source - mean) * (target - middle), axis=0, weights=weight)
-        gain = np.clip((both + 1e-4 * gain) / (spread + 1e-4), 0.2, 5.0)
-        offset = middle - gain * mean
-    return np.clip(photo * gain + offset, 0, 1.5).astype(np.float32)
+    start = np.stack([np.median(target, 0) / np.maximum(np.median(source, 0), 1e-3), np.zeros(3)])
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return (x[:3] * source + x[3:] - target).ravel()
+
+    fitted = scipy.optimize.least_squares(errors, start.ravel(), loss="cauchy", f_scale=0.04).x
+    return np.clip(photo * fitted[:3] + fitted[3:], 0, 1.5).astype(np.float32)
 
 
 def find_shift(
@@ -50,19 +47,23 @@ def find_shift(
         grey = cv2.GaussianBlur(image.mean(-1), (0, 0), 1.0)
         return np.minimum(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)), 0.5)
 
-    own, other = edges(photo), edges(render)
     reach = max(round(0.025 * photo.shape[1]), 1)  # px; errors of poses are smaller
-    shifts = [(y, x) for y in range(-reach, reach + 1) for x in range(-reach, reach + 1)]
-    shifts.sort(key=lambda shift: shift[0] ** 2 + shift[1] ** 2)
-    errors = [np.abs(shifted(own, shift) - other)[known].mean() for shift in shifts]
-    return shifts[int(np.argmin(errors))]
+    around = cv2.copyMakeBorder(edges(photo), reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    errors = cv2.matchTemplate(around, edges(render), cv2.TM_SQDIFF, mask=known.astype(np.float32))
+    row, column = np.unravel_index(errors.argmin(), errors.shape)
+    return reach - int(row), reach - int(column)
 
 
 def shifted(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
     """Moves an image by (rows, columns), px; its edge is repeated."""
-    height, width = image.shape[:2]
-    rows, columns = (np.clip(np.arange(n) - s, 0, n - 1) for n, s in zip((height, width), shift))
-    return image[rows][:, columns]
+    (down, across), size = shift, image.shape[1::-1]
+    motion = np.array([[1.0, 0, across], [0, 1, down]])
+    return cv2.warpAffine(image, motion, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _shifts(image: np.ndarray) -> list[np.ndarray]:
+    """An image moved by up to one px each way."""
+    return [shifted(image, (y, x)) for y in (1, 0, -1) for x in (1, 0, -1)]
 
 
 def colour_cost(
@@ -77,15 +78,6 @@ def colour_cost(
         apart = lab - cv2.cvtColor(np.clip(moved * gain[..., None], 0, 1), cv2.COLOR_RGB2LAB)
         best = np.minimum(best, np.einsum("hwc,hwc->hw", apart, apart) + (_LIGHT_STEP * np.log(gain)) ** 2)
     return np.minimum(np.sqrt(best) / COLOUR_STEP, 1.0)
-
-
-def _shifts(image: np.ndarray) -> Iterator[np.ndarray]:
-    """An image moved by up to one px each way; its edge is repeated."""
-    height, width = image.shape[:2]
-    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    for y in range(3):
-        for x in range(3):
-            yield padded[y : y + height, x : x + width]
 
 
 def depth_cost(depth: Float[np.ndarray, "h w"], rendered: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
-from jsecon.field.evidence import view_evidence
 from jsecon.numerics import axes_across
 from jsecon.query.render import hide
 from jsecon.splat.points import back_project
@@ -51,6 +50,8 @@ MIN_RADIUS = 2.0
 """Radius of the largest disc in the pixels of a new thing: edges that lie a pixel off are narrower."""
 MIN_MOVE = 0.2
 """Shift, as a share of its size, or turn, radians, from which an object has moved."""
+MIN_PROBABILITY = 0.5
+"""Probability of what became of an object below which it is "unsure": neither reported nor applied as a change."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
 _SUBPIXEL = 16
@@ -136,7 +137,7 @@ class _Body:
 
     def __init__(self, gaussians: Gaussians, rows: np.ndarray, up: np.ndarray):
         means = np.asarray(gaussians.means, np.float64)
-        own = means[rows] if len(rows) else np.zeros((1, 3))
+        own = means[rows]
         self.middle = np.median(own, axis=0)
         self.foot = self.middle + (np.quantile(own @ up, 0.03) - self.middle @ up) * up
         self.extent = float(np.linalg.norm(np.quantile(own, 0.95, 0) - np.quantile(own, 0.05, 0))) / np.sqrt(2)
@@ -189,18 +190,19 @@ def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: 
     return view._replace(cost=view.compare(*image))
 
 
-def _pooled(view: _View, gaussians: Gaussians, labels: np.ndarray, count: int) -> np.ndarray:
-    """Sums each object's weight on pixels that are explained, that are not, and that are not known: (K, 3).
+def _owners(gaussians: Gaussians, labels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Finds the object that makes up more than half of each pixel (H, W); -1 without one."""
+    owners = np.full((camera.height, camera.width), -1)
+    for first in range(0, int(labels.max(initial=-1)) + 1, 32):  # scenes share the program
+        things = (labels[:, None] == first + np.arange(32)).astype(np.float32)
+        shares = np.asarray(render(gaussians, camera, things).features)
+        owners = np.where(shares.max(-1) > 0.5, first + shares.argmax(-1), owners)
+    return owners
 
-    A measured surface in front of the scene tells nothing of what it hides.
-    """
-    image = np.where(np.isnan(view.cost), -1, view.cost > 0.5).astype(np.int32)
-    if view.depth is not None:
-        image = np.where(np.nan_to_num(depth_cost(view.depth, view.z)) < -0.5, -1, image)
-    matrix = view_evidence(gaussians, view.camera, image, 2).matrix(len(labels), 2)
-    inside = np.flatnonzero(labels >= 0)
-    columns = matrix[inside].toarray()
-    return np.stack([np.bincount(labels[inside], column, count) for column in columns.T], axis=1)
+
+def _ranked(scores: np.ndarray, kept: np.ndarray) -> tuple[int, ...]:
+    """Lists the frames that are kept, those of the highest scores first."""
+    return tuple(t for t in np.argsort(-scores, kind="stable").tolist() if kept[t])
 
 
 def object_changes(
@@ -211,25 +213,22 @@ def object_changes(
     depths: Float[np.ndarray, "f h w"] | None = None,
     *,
     up: Float[np.ndarray, " 3"],
-    min_probability: float = 0.5,
 ) -> list[Change]:
     """Finds what became of each object of a scene, and what is new, in new photographs.
 
     Args:
       gaussians: Scene of N Gaussians.
-      labels: Object of each Gaussian, 0 .. K-1; -1 for surroundings, which do not change.
+      labels: Object of each Gaussian; -1 for surroundings, which do not change.
       frames: New photographs.
       cameras: Batch of F cameras in the scene's world.
       depths: z-depth of the photographs, world units, 0 = unknown.
       up: Up axis of the scene's world, unit length.
-      min_probability: Probability of a kind below which it is "unsure": neither reported nor applied as a change.
 
     Returns:
-      A change for each of the K objects, in order, then the new ones.
+      A change for each object, in order, then the new ones.
     """
     require_shape("labels", labels, (gaussians.count,), "Give one label per Gaussian.")
     gaussians, cameras = jax.tree.map(np.asarray, (gaussians, cameras))
-    count = int(labels.max(initial=-1)) + 1
     given = [None] * len(frames) if depths is None else depths
     views = [_first_view(gaussians, camera, frame, depth) for camera, frame, depth in zip(cameras, frames, given)]
     for t, view in enumerate(views):
@@ -238,35 +237,29 @@ def object_changes(
             problem = f"the scene explains {explained:.0%} of its pixels"
             remedy = "Check that it shows the field's place, and that its pose is in the world of the field's capture."
             raise InputError(f"photograph {t + 1}", problem, f"{MIN_EXPLAINED:.0%} or more", remedy)
-    pooled = np.stack([_pooled(view, gaussians, labels, count) for view in views], axis=1)  # (K, F, 3)
-    known = pooled[..., :2].sum(-1)
-    differing = pooled[..., 1] / np.maximum(known, 1e-9)
-    seen = known >= MIN_PIXELS
-    excess = np.where(seen, differing - DISPLACED_SHARE, 0).sum(1) / np.maximum(seen.sum(1), 1)
-    displaced = seen.any(1) & (excess > 0)
     search = _Search(gaussians, labels, views, cameras, up / np.linalg.norm(up))
-    changes = [search.unmoved(k, seen[k], excess[k], differing[k]) for k in range(count)]
-    shares = (known * differing).sum(1) / np.maximum(known.sum(1), 1e-9)
-    suspects = np.flatnonzero((seen.sum(1) > 1) & ~displaced & (shares >= TURN_SHARE)).tolist()
-    turns = {k: search.turn(changes[k]) for k in suspects}
-    usual = sorted([0.0, 0.0, 0.0, *(gain for _, gain in turns.values())])[-3]  # two may be turned
-    least = MIN_TURN_GAIN + LIGHT_FACTOR * usual
-    turns = {k: (motion, 40 * (gain - least)) for k, (motion, gain) in turns.items() if gain >= least}
-    search.remove(np.flatnonzero(displaced).tolist(), list(turns))
+    known, differing = search.count_pixels()
+    seen = known >= MIN_PIXELS
+    share = differing / np.maximum(known, 1)
+    excess = np.where(seen, share - DISPLACED_SHARE, 0).sum(1) / np.maximum(seen.sum(1), 1)
+    displaced = np.flatnonzero(seen.any(1) & (excess > 0)).tolist()
+    objects = np.unique(labels[labels >= 0]).tolist()
+    changes = {k: search.unmoved(k, seen[k], excess[k], share[k]) for k in objects}
+    turned = (seen.sum(1) > 1) & (differing.sum(1) >= TURN_SHARE * known.sum(1)) & ~(seen.any(1) & (excess > 0))
+    turns = search.turns({k: changes[k].frames for k in np.flatnonzero(turned).tolist()})
+    search.remove(displaced, list(turns))
     moved = {k: search.settle(k, *turn) for k, turn in turns.items()} | search.moved()
-    changes = [moved.get(k, change) for k, change in enumerate(changes)]
+    changes |= moved
     clusters = search.clusters()
-    for k in np.flatnonzero(displaced).tolist():
+    for k in displaced:
         if k not in moved:
             changes[k] = search.gone(k, seen[k])
-        clusters = [cluster for cluster in clusters if cluster.inside(search.silhouettes(k)) <= 0.6]
-    changes += [search.new(cluster) for cluster in clusters]
-    return [
-        dataclasses.replace(change, kind="unsure", suspected=change.kind)
-        if change.probability < min_probability
-        else change
-        for change in changes
-    ]
+        clusters = [cluster for cluster in clusters if cluster.inside(search.owners == k) <= 0.6]
+    found = [*changes.values(), *(search.new(cluster) for cluster in clusters)]
+    for n, change in enumerate(found):
+        if change.probability < MIN_PROBABILITY:
+            found[n] = dataclasses.replace(change, kind="unsure", suspected=change.kind)
+    return found
 
 
 class _Cluster(NamedTuple):
@@ -310,29 +303,45 @@ class _Search:
         self.gaussians, self.labels, self.first, self.cameras, self.up = gaussians, labels, views, cameras, up
         self.flat = axes_across(up)
         self.body = functools.cache(lambda k: _Body(gaussians, np.flatnonzero(labels == k), up))
+        self.owners = np.stack([_owners(gaussians, labels, view.camera) for view in views])
+
+    def count_pixels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Counts each object's pixels in each frame (K, F): those that are known, and those that are not explained.
+
+        A measured surface in front of the scene tells nothing of what it hides.
+        """
+        count, columns = int(self.labels.max(initial=-1)) + 1, []
+        for view, owners in zip(self.first, self.owners):
+            known = (owners >= 0) & ~np.isnan(view.cost)
+            if view.depth is not None:
+                known &= ~(depth_cost(view.depth, view.z) < -0.5)
+            columns.append([np.bincount(owners[mask], minlength=count) for mask in (known, known & (view.cost > 0.5))])
+        known, differing = np.array(columns).transpose(1, 2, 0)
+        return known, differing
 
     def remove(self, displaced: list[int], turned: list[int]) -> None:
         """Renders the scene without some objects."""
         self.displaced, mask = displaced, np.isin(self.labels, [*displaced, *turned])
         self.views = [view.render(hide(self.gaussians, mask)) if mask.any() else view for view in self.first]
 
-    def silhouettes(self, k: int) -> np.ndarray:
-        """(F, H, W) the pixels that an object makes up in the scene as it was."""
-        channel = np.repeat((self.labels == k)[:, None], 3, 1).astype(np.float32)
-        return np.stack(
-            [
-                np.asarray(render(self.gaussians, v.camera, channel, depth=True).features)[..., 0] > 0.5
-                for v in self.first
-            ]
-        )
+    def change(
+        self,
+        kind: str,
+        k: int,
+        probability: float,
+        frames: tuple[int, ...],
+        motion: np.ndarray | None = None,
+        after: np.ndarray | None = None,
+    ) -> Change:
+        """Describes what became of an object; by default it stands where it stood."""
+        motion, before, middle = np.eye(4) if motion is None else motion, self.owners == k, self.body(k).middle
+        place = motion[:3, :3] @ middle + motion[:3, 3]
+        return Change(kind, k, probability, frames, motion, place, before, before if after is None else after)
 
-    def unmoved(self, k: int, seen: np.ndarray, excess: float, differing: np.ndarray) -> Change:
+    def unmoved(self, k: int, seen: np.ndarray, excess: float, share: np.ndarray) -> Change:
         """The change of an object that is where it was, or that no frame sees."""
-        empty = np.zeros((len(self.first), *self.first[0].alpha.shape), bool)
-        kind = "same" if seen.any() else "not seen"
-        order = [int(t) for t in np.argsort(differing) if seen[t]]
-        probability = _sigmoid(-12 * excess) if seen.any() else 1.0
-        return Change(kind, k, probability, tuple(order), np.eye(4), self.body(k).middle, empty, empty)
+        kind, probability = ("same", _sigmoid(-12 * excess)) if seen.any() else ("not seen", 1.0)
+        return self.change(kind, k, probability, _ranked(-share, seen))
 
     def clusters(self) -> list[_Cluster]:
         """Places the unexplained pixels of the frames, and joins those that lie at one place; of two frames or more."""
@@ -356,30 +365,21 @@ class _Search:
         number, image, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
         down = -(np.asarray(view.camera.world_to_camera, np.float64)[:3, :3] @ self.up)[:2]
         height, width = mask.shape
+        surface = view.z if view.depth is None else np.where(view.depth > 0, view.depth, view.z)
+        bare = np.zeros(mask.shape, bool) if view.depth is None else depth_cost(view.depth, view.z) > 0.3
         result = []
         for n in range(1, number):
             left, top, across, tall, area = stats[n]
-            if area < MIN_PIXELS or left == 0 or top == 0 or left + across == width or top + tall == height:
-                continue
             inside = image == n
             radius = float(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5).max())
-            if radius < MIN_RADIUS:
+            cut = left == 0 or top == 0 or left + across == width or top + tall == height
+            if cut or area < MIN_PIXELS or radius < MIN_RADIUS or bare[inside].mean() > 0.5:  # what went left it bare
                 continue
-            if view.depth is not None and np.mean(np.nan_to_num(depth_cost(view.depth, view.z))[inside] > 0.3) > 0.5:
-                continue  # what went left it bare
-            measured = np.zeros_like(inside) if view.depth is None else inside & (view.depth > 0)
-            if view.depth is not None and measured.any():
-                z = float(np.quantile(view.depth[measured], 0.5, method="nearest"))
-                measured &= np.abs(view.depth - z) <= z * np.sqrt(area) / float(view.camera.fx)  # not what is behind it
-                surface = back_project(view.camera, np.argwhere(measured), view.depth[measured])
-                contact = np.median(surface, axis=0)
-                contact += (np.quantile(surface @ self.up, 0.05) - contact @ self.up) * self.up
-            else:
-                rows, columns = np.nonzero(inside)
-                along = down[0] * columns + down[1] * rows
-                low = along >= np.quantile(along, 0.95)
-                z = float(np.median(view.z[rows[low], columns[low]]))
-                contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
+            rows, columns = np.nonzero(inside)
+            along = down[0] * columns + down[1] * rows
+            low = along >= np.quantile(along, 0.95)
+            z = float(np.median(surface[rows[low], columns[low]]))
+            contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
             size = z * np.sqrt(area) / float(view.camera.fx)
             ahead = contact - np.asarray(view.camera.centres, np.float64)
             ahead -= (ahead @ self.up) * self.up
@@ -390,34 +390,27 @@ class _Search:
     def moved(self) -> dict[int, Change]:
         """Finds the displaced objects elsewhere, the one that explains most first."""
         result: dict[int, Change] = {}
-        left = set(self.displaced)
-        while left:
-            clusters = self.clusters()[:6]  # the largest
-            places = [(cluster.place, cluster.size) for cluster in clusters]
+        while left := [k for k in self.displaced if k not in result]:
+            places = [(cluster.place, cluster.size) for cluster in self.clusters()[:6]]  # the largest
             bodies = map(self.body, self.displaced)  # their own, too: what moved may hide it, or it is turned
             places += [(body.foot, body.extent) for body in bodies]
-            fits = [self._fit(k, *place) for k in left for place in places]
-            fits = [fit for fit in fits if fit is not None and fit.gain >= MIN_GAIN]
+            fits = [fit for k in left for place in places if (fit := self._fit(k, *place)) and fit.gain >= MIN_GAIN]
             if not fits:
                 break
             best = max(fits, key=lambda fit: fit.total)
-            left.discard(best.object)
             result[best.object] = self.settle(best.object, best.motion, 14 * (best.gain - MIN_GAIN) + 0.5)
         return result
 
     def settle(self, k: int, motion: np.ndarray, evidence: float) -> Change:
         """Puts an object into the views where it is now; `evidence` is the logit of its probability."""
-        before, masks = self.silhouettes(k), []
-        for t, view in enumerate(self.views):
-            self.views[t], inside = view.place(self.body(k), motion)
-            masks.append(inside)
-        order = tuple(int(t) for t in np.argsort([-m.sum() for m in masks]) if masks[t].sum() >= MIN_PIXELS)
-        middle = self.body(k).middle
-        place = middle @ motion[:3, :3].T + motion[:3, 3]
-        away = np.linalg.norm(place - middle) / max(self.body(k).extent, 1e-9)
-        if away < MIN_MOVE and Rotation.from_matrix(motion[:3, :3]).magnitude() < MIN_MOVE:
-            return Change("same", k, _sigmoid(evidence), order, np.eye(4), middle, before, before)
-        return Change("moved", k, _sigmoid(evidence), order, motion, place, before, np.stack(masks))
+        self.views, masks = map(list, zip(*(view.place(self.body(k), motion) for view in self.views)))
+        after, pixels = np.stack(masks), np.sum(masks, axis=(1, 2))
+        frames = _ranked(pixels, pixels >= MIN_PIXELS)
+        change = self.change("moved", k, _sigmoid(evidence), frames, motion, after)
+        shift, turn = change.place - change.start, Rotation.from_matrix(motion[:3, :3]).magnitude()
+        if np.linalg.norm(shift) < MIN_MOVE * self.body(k).extent and turn < MIN_MOVE:
+            return self.change("same", k, _sigmoid(evidence), frames)
+        return change
 
     def _motion(self, k: int, pose: np.ndarray) -> np.ndarray:
         """The motion that turns an object about its middle by pose[2], and shifts it by pose[:2] and up by pose[3]."""
@@ -426,52 +419,56 @@ class _Search:
         motion[:3, 3] = middle - motion[:3, :3] @ middle + pose[:2] @ self.flat + pose[3] * self.up
         return motion
 
-    def turn(self, change: Change) -> tuple[np.ndarray, float]:
-        """The turn in its place that explains most of an object, and the cost per pixel that it takes away by that."""
-        k = change.object
-        views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in change.frames[:_FIT_FRAMES]]
-        motions = [self._motion(k, np.array([0, 0, angle, 0])) for angle in np.radians(np.arange(0, 341, 20))]
-        gains, pixels = zip(*(_gain(views, self.body(k), motion) for motion in motions))
-        return motions[int(np.argmax(gains))], (max(gains) - gains[0]) / max(pixels[0], 1)
+    def turns(self, suspects: dict[int, tuple[int, ...]]) -> dict[int, tuple[np.ndarray, float]]:
+        """Finds which of some objects, with the frames that see them, are turned in their place.
+
+        Returns:
+          The motion of each that is, and the logit of its probability.
+        """
+        best = {}
+        for k, frames in suspects.items():
+            views = [self.first[t].render(hide(self.gaussians, self.labels == k)) for t in frames[:_FIT_FRAMES]]
+            motions = [self._motion(k, np.array([0, 0, angle, 0])) for angle in np.radians(np.arange(0, 341, 20))]
+            gains, pixels = zip(*(_gain(views, self.body(k), motion) for motion in motions))
+            best[k] = motions[int(np.argmax(gains))], (max(gains) - gains[0]) / max(pixels[0], 1)
+        usual = sorted([0.0, 0.0, 0.0, *(gain for _, gain in best.values())])[-3]  # two may be turned
+        least = MIN_TURN_GAIN + LIGHT_FACTOR * usual
+        return {k: (motion, 40 * (gain - least)) for k, (motion, gain) in best.items() if gain >= least}
 
     def _fit(self, k: int, place: np.ndarray, size: float) -> "_Fit | None":
         """Turns and shifts an object about a place until it explains most of the photographs there."""
         body = self.body(k)
-        middle, extent = body.middle, body.extent
-        if not 1 / 3 < size / max(extent, 1e-9) < 3:
+        if not 1 / 3 < size / max(body.extent, 1e-9) < 3:
             return None
-        shift = (place - middle) @ self.flat.T
-        lift = float((place - body.foot) @ self.up)
-        lift = 0.0 if abs(lift) < 0.35 * extent else lift
-        frames = self._frames_near(middle + shift @ self.flat + lift * self.up)
+        shift, lift = (place - body.middle) @ self.flat.T, float((place - body.foot) @ self.up)
+        lift = 0.0 if abs(lift) < 0.35 * body.extent else lift
+        views = [self.views[t] for t in self._frames_near(body.middle + shift @ self.flat + lift * self.up)]
 
         def score(pose: np.ndarray) -> tuple[float, int]:
-            return _gain([self.views[t] for t in frames], body, self._motion(k, pose))
+            return _gain(views, body, self._motion(k, pose))
 
         best = np.array([*shift, 0.0, lift])
         value = score(best)
         if value[1] < MIN_PIXELS or value[0] < -0.1 * value[1]:
             return None
-        axes = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * extent
-        for n, (step, turn) in enumerate(((0.35, 0.8), (0.18, 0.4), (0.09, 0.2), (0.045, 0.1))):
-            turns = np.arange(1, 8) * np.pi / 4 if n == 1 else (-turn, turn) if n else ()
-            moves = [np.array([*step * axis, 0, 0]) for axis in axes] + [np.array([0, 0, angle, 0]) for angle in turns]
+        axes = np.array([(1, 0, 0, 0), (-1, 0, 0, 0), (0, 1, 0, 0), (0, -1, 0, 0)]) * body.extent
+        yaw = np.array([0.0, 0, 1, 0])
+        for n, step in enumerate((0.35, 0.18, 0.09, 0.045)):
+            turns = np.arange(1, 8) * np.pi / 4 if n == 1 else np.array([-2, 2]) * step if n else np.zeros(0)
+            moves = [*(step * axes), *(turns[:, None] * yaw)]
             for _ in range(3):
-                options = [best + move for move in moves]
-                values = [score(option) for option in options]
-                top = int(np.argmax([option_value[0] for option_value in values]))
-                if values[top][0] <= value[0]:
+                options = [(*score(best + move), best + move) for move in moves]
+                top = max(options, key=lambda option: option[0])
+                if top[0] <= value[0]:
                     break
-                best, value = options[top], values[top]
-        gain = value[0] / max(value[1], 1)
-        return _Fit(k, self._motion(k, best), value[0], gain)
+                value, best = top[:2], top[2]
+        return _Fit(k, self._motion(k, best), value[0], value[0] / max(value[1], 1))
 
-    def _frames_near(self, place: np.ndarray) -> list[int]:
+    def _frames_near(self, place: np.ndarray) -> tuple[int, ...]:
         """The frames that see a place, at most _FIT_FRAMES, the nearest first."""
         poses = self.cameras.world_to_camera
         depths = poses[:, 2, :3] @ place + poses[:, 2, 3]
-        depths[~points_in_view(self.cameras, place[None])[:, 0]] = np.inf
-        return [int(t) for t in np.argsort(depths)[:_FIT_FRAMES] if np.isfinite(depths[t])]
+        return _ranked(-depths, points_in_view(self.cameras, place[None])[:, 0])[:_FIT_FRAMES]
 
     def gone(self, k: int, seen: np.ndarray) -> Change:
         """The change of an object that is not where it was, nor elsewhere.
@@ -479,18 +476,17 @@ class _Search:
         It is gone where the scene without it explains the photographs. Where something of its outline stands in its
         place, it has another look. Else something hides it.
         """
-        before, middle = self.silhouettes(k), self.body(k).middle
-        inside = [(first.cost[m], view.cost[m]) for first, view, m in zip(self.first, self.views, before)]
-        margins = [np.nanmean(a - b) if len(a) and np.isfinite(a - b).any() else 0.0 for a, b in inside]
-        margin = float(np.mean(np.asarray(margins)[seen]))
-        order = tuple(int(t) for t in np.argsort(-np.asarray(margins)) if seen[t])
+        before = self.owners == k
+        gains = [(first.cost - view.cost)[mask] for first, view, mask in zip(self.first, self.views, before)]
+        margins = np.array([np.mean(gain[np.isfinite(gain)]) if np.isfinite(gain).any() else 0.0 for gain in gains])
+        margin, frames = float(margins[seen].mean()), _ranked(margins, seen)
         if margin >= GONE_MARGIN:
             gone = _sigmoid(10 * (margin - GONE_MARGIN))
-            return Change("gone", k, gone, order, np.eye(4), middle, before, np.zeros_like(before))
+            return self.change("gone", k, gone, frames, after=np.zeros_like(before))
         after = before & np.stack([np.nan_to_num(view.cost) > 0.5 for view in self.views])
         filled = float(after.sum() / max(before[seen].sum(), 1))
         kind, probability = ("look", filled) if filled > 0.5 else ("not seen", 1 - filled)
-        return Change(kind, k, probability, order, np.eye(4), middle, before, after)
+        return self.change(kind, k, probability, frames, after=after)
 
     def new(self, cluster: _Cluster) -> Change:
         """Something that no object explains, coherent over the frames."""
@@ -498,10 +494,11 @@ class _Search:
         for t, mask in cluster.masks.items():
             after[t] = mask
         visible = max(len(self._frames_near(cluster.place)), len(cluster.masks))
-        order = tuple(sorted(cluster.masks, key=lambda t: -int(cluster.masks[t].sum())))
+        pixels = after.sum((1, 2))
         place = cluster.place + 0.5 * cluster.size * self.up
         probability = len(cluster.masks) / (visible + 0.5) * (1 - np.exp(1 - cluster.radius / 1.5))
-        return Change("new", -1, float(probability), order, np.eye(4), place, np.zeros_like(after), after)
+        frames = _ranked(pixels, pixels > 0)
+        return Change("new", -1, float(probability), frames, np.eye(4), place, np.zeros_like(after), after)
 
 
 class _Fit(NamedTuple):

@@ -7,8 +7,7 @@ its Gaussians nor its regions answer a query; what is new has Gaussians and a re
 
 import dataclasses
 import json
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,25 +15,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError
-from jsecon.field.ledger import Ledger, LedgerView, add_views
 from jsecon.files import parse_json
+from jsecon.fit.growth import pad_rows
 from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Event, Gaussians, LanguageField
 
-_QUESTION = re.compile(
-    r"(?:what|which (?:things?|objects?))(?:'s| has| have| is| are| was| were)?"
-    r" (moved|gone|missing|disappeared|removed|new|added|appeared|changed)\s*\??",
-    re.IGNORECASE,
-)
-_KINDS = {"moved": "moved", "changed": ""} | dict.fromkeys(("new", "added", "appeared"), "new")
-_KINDS |= dict.fromkeys(("gone", "missing", "disappeared", "removed"), "gone")
+_QUESTIONS = {"what moved": "moved", "what is gone": "gone", "what is new": "new", "what changed": ""}
 
 
 def change_question(text: str) -> str | None:
     """The kind of event that a question such as "what moved" asks for, "" for any; None for another text."""
-    match = _QUESTION.fullmatch(text.strip())
-    return None if match is None else _KINDS[match[1].lower()]
+    return _QUESTIONS.get(text.lower().strip(" ?").replace("what's", "what is").replace("what has", "what"))
 
 
 def _patched(field: LanguageField, event: Event) -> LanguageField:
@@ -64,9 +56,16 @@ def _event(field: LanguageField, rows: np.ndarray, regions: np.ndarray, descript
     )
 
 
-def _remembered(field: LanguageField, event: Event, new: Event) -> LanguageField:
-    """A field after the columns of `new`, with `event` in its history."""
-    return dataclasses.replace(_patched(field, new), history=(*field.history, event))
+def _absent(event: Event) -> Event:
+    """Its columns where its Gaussians and regions are absent: transparent, never seen, without embedding."""
+    logits = np.full_like(event.gaussians.opacity_logits, HIDDEN_LOGIT)
+    hidden = dataclasses.replace(event.gaussians, opacity_logits=logits)
+    views, embeddings = np.zeros_like(event.views), np.zeros_like(event.embeddings)
+    return dataclasses.replace(event, gaussians=hidden, views=views, embeddings=embeddings)
+
+
+def _with_event(field: LanguageField, event: Event) -> LanguageField:
+    return dataclasses.replace(field, history=(*field.history, event))
 
 
 def move_object(
@@ -76,57 +75,42 @@ def move_object(
     event = _event(field, np.flatnonzero(mask), np.zeros(0, int), description)
     moved = transform_gaussians(event.gaussians, motion)
     moved = jax.tree.map(lambda a, b: np.asarray(a, b.dtype), moved, event.gaussians)
-    return _remembered(field, event, dataclasses.replace(event, gaussians=moved))
+    return _with_event(_patched(field, dataclasses.replace(event, gaussians=moved)), event)
 
 
 def remove_object(
     field: LanguageField, mask: Bool[np.ndarray, " n"], regions: Sequence[int], description: dict[str, Any]
 ) -> LanguageField:
-    """Makes Gaussians and regions absent: transparent, never seen, without embedding. The history keeps them."""
+    """Makes Gaussians and regions absent. The history keeps them."""
     event = _event(field, np.flatnonzero(mask), np.asarray(regions, int), description)
-    logits = np.full_like(event.gaussians.opacity_logits, HIDDEN_LOGIT)
-    hidden = dataclasses.replace(event.gaussians, opacity_logits=logits)
-    zeros = np.zeros_like(event.views), np.zeros_like(event.embeddings)
-    new = dataclasses.replace(event, gaussians=hidden, views=zeros[0], embeddings=zeros[1])
-    return _remembered(field, event, new)
+    return _with_event(_patched(field, _absent(event)), event)
 
 
 def add_unseen(field: LanguageField, things: Sequence[Gaussians]) -> LanguageField:
     """Adds Gaussians that no view has seen behind those of a field; all others stay as they are, to the bit."""
     gaussians = jax.tree.map(lambda *columns: np.concatenate(columns), field.gaussians, *things)
-    more = gaussians.count - field.gaussians.count
-
-    def longer(column, value=0):
-        return np.concatenate([column, np.full((more, *np.shape(column)[1:]), value, column.dtype)])
-
     rows = "weights", "labelled", "total", "max_pixel_weight", "views", "weight_where_region_visible"
-    columns = {name: longer(column) for name in rows if (column := getattr(field.votes, name)) is not None}
-    votes = dataclasses.replace(field.votes, regions=longer(field.votes.regions, -1), **columns)
-    leaf = None if field.leaf is None else longer(field.leaf, -1)
+    columns = pad_rows({name: getattr(field.votes, name) for name in rows}, gaussians.count)
+    regions, leaf = pad_rows((field.votes.regions, field.leaf), gaussians.count)
+    for column in (regions, leaf):
+        if column is not None:
+            column[field.gaussians.count :] = -1
+    votes = dataclasses.replace(field.votes, regions=regions, **columns)
     return dataclasses.replace(field, gaussians=gaussians, votes=votes, leaf=leaf)
 
 
-def add_objects(
-    field: LanguageField,
-    ledger: Ledger,
-    things: Sequence[Gaussians],
-    views: Mapping[str, LedgerView],
-    descriptions: Sequence[dict[str, Any]],
-) -> tuple[LanguageField, Ledger]:
-    """Adds things to a field and its ledger: Gaussians of the field's world, and new views that show them.
-
-    Each gets the next region, of which `views` speak already, and Gaussians behind those of the field.
-    """
-    region, first = field.regions.count, field.gaussians.count
-    owners = np.repeat(np.arange(region, region + len(things)), [thing.count for thing in things]).astype(np.int32)
-    field = add_unseen(field, things)
-    field, ledger = add_views(field, Ledger(ledger.num_regions, ledger.views), views)
-    history = field.history
-    for number, description in enumerate(descriptions, region):
-        rows = first + np.flatnonzero(owners == number)
-        absent = remove_object(field, np.isin(np.arange(field.gaussians.count), rows), [number], {})
-        history = *history, _event(absent, rows, np.array([number]), description | {"region": number})
-    return dataclasses.replace(field, history=history), ledger
+def record_new(
+    before: LanguageField, field: LanguageField, things: Sequence[Gaussians], descriptions: Sequence[dict[str, Any]]
+) -> LanguageField:
+    """Keeps in the history that things are new, which `add_unseen` added to a field and views have shown since."""
+    first, strongest = before.gaussians.count, np.asarray(field.votes.regions)[:, 0]
+    for thing, description in zip(things, descriptions):
+        rows = np.arange(first, first + thing.count)
+        first += thing.count
+        regions = np.unique(strongest[rows][strongest[rows] >= before.regions.count])
+        named = description | {"region": int(regions[0]) if len(regions) else None}
+        field = _with_event(field, _absent(_event(field, rows, regions, named)))
+    return field
 
 
 def dates(field: LanguageField) -> list[str]:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.fit.photometric import SSIM_WINDOW, psnr, ssim_map
+from jsecon.fit.photometric import C1, C2, SSIM_WINDOW, psnr
 from jsecon.fit.resize import resize_frame, resize_mask, shrink_cameras
 from jsecon.parallel import map_over_processes
 from jsecon.splat.render import render_rgb
@@ -27,13 +27,23 @@ def _compare(
     """PSNR over the counted pixels, and the mean SSIM over their windows, with the rendering in place of the others."""
     image = np.clip(image, 0, 1)
     target = np.where(counted[..., None], frame.astype(np.float32) / 255, image)
-    similarity = ssim_map(image, target, _blur)[counted].mean(dtype=np.float64)
+    similarity = ssim_map(image, target)[counted].mean(dtype=np.float64)
     return float(psnr(image[counted], target[counted])), float(similarity)
 
 
-def _blur(image: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
-    """Blurs an image with the SSIM window, with zeros outside of it, by OpenCV: no program is compiled for a size."""
-    return cv2.sepFilter2D(image, -1, SSIM_WINDOW, SSIM_WINDOW, borderType=cv2.BORDER_CONSTANT)
+def ssim_map(image: Float[np.ndarray, "h w c"], target: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13).
+
+    OpenCV blurs: no program is compiled for a size.
+    """
+    products = image, target, image * image, target * target, image * target
+    mean_i, mean_t, square_i, square_t, product = (
+        cv2.sepFilter2D(each, -1, SSIM_WINDOW, SSIM_WINDOW, borderType=cv2.BORDER_CONSTANT) for each in products
+    )
+    variance_i, variance_t = square_i - mean_i * mean_i, square_t - mean_t * mean_t
+    covariance = product - mean_i * mean_t
+    numerator = (2 * mean_i * mean_t + C1) * (2 * covariance + C2)
+    return numerator / ((mean_i * mean_i + mean_t * mean_t + C1) * (variance_i + variance_t + C2))
 
 
 def measure_quality(

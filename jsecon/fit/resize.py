@@ -5,7 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 
-from jsecon.types import Camera
+from jsecon.types import Camera, Capture
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -39,3 +39,16 @@ def resize_mask(mask: np.ndarray, cameras: Camera) -> np.ndarray:
         return np.asarray(mask)
     size = cameras.width, cameras.height
     return cv2.resize(np.asarray(mask, np.float32), size, interpolation=cv2.INTER_AREA) > 0
+
+
+def resize_capture(capture: Capture, cameras: Camera) -> Capture:
+    """Brings the images of a capture to the size of cameras, which take the place of its own."""
+    size = cameras.width, cameras.height
+    depths, ignored = capture.depths, capture.ignored
+    if depths is not None:
+        depths = [cv2.resize(np.asarray(z, np.float32), size, interpolation=cv2.INTER_NEAREST) for z in depths]
+        depths = np.stack(depths)
+    if ignored is not None:
+        ignored = np.stack([resize_mask(np.asarray(mask), cameras) for mask in ignored])
+    frames = np.stack([resize_frame(np.asarray(frame), cameras) for frame in capture.frames])
+    return dataclasses.replace(capture, frames=frames, cameras=cameras, depths=depths, ignored=ignored)

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, UInt8
 from scipy import sparse
 
 from jsecon.association.scene import FrameSuperpixels, frame_superpixels, label_by_regions
@@ -18,35 +18,21 @@ from jsecon.field.evidence import IGNORED, pack_evidence, plan_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row, view_order
 from jsecon.field.membership import LABELLED_PART, SHARE_THRESHOLD
 from jsecon.files import parse_json
-from jsecon.fit.resize import resize_camera, resize_frame, resize_mask
+from jsecon.fit.resize import resize_camera, resize_capture, resize_frame
 from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.capture import lone_photographs, read_posed_images
-from jsecon.read.captures.frames import FrameOptions, frame_names, transform_poses
+from jsecon.read.captures.frames import FrameOptions, frame_names, move_capture, take_frames
 from jsecon.read.captures.images import decode_jpeg, encode_jpeg, read_image
 from jsecon.read.masks.masks import load_proposals
 from jsecon.splat.sh import C0
-from jsecon.types import Camera, Capture, LanguageField, Progress, Votes
+from jsecon.types import Capture, LanguageField, Progress, Votes
 from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.protocols import Embedder
 
 MIN_CORRELATION = 0.75
 """Least correlation of a photograph with what the scene shows from its pose. Held-out ones of fox and bonsai have
 0.95 and more from their own poses, and up to 0.72 from those of their neighbours."""
-
-
-class NewFrame(NamedTuple):
-    """A photograph at the size of a field's frames."""
-
-    pixels: UInt8[np.ndarray, "h w 3"]
-    camera: Camera
-    """In the field's world."""
-    ignored: Bool[np.ndarray, "h w"] | None = None
-    """Pixels that count nowhere."""
-    depth: Float32[np.ndarray, "h w"] | None = None
-    """z-depth in units of the field's world, 0 = unknown."""
-    things: Bool[np.ndarray, "m h w"] | None = None
-    """Masks of things whose Gaussians no view of the field saw."""
 
 
 def read_frames(
@@ -56,10 +42,11 @@ def read_frames(
     poses: Path | None,
     refuse: Callable[[InputError], None],
     progress: Progress,
-) -> dict[str, NewFrame]:
+) -> Capture:
     """Reads photographs, finds poses that they lack, and leaves out those that the field has.
 
-    `refuse` gets the error of each photograph that cannot be read or placed.
+    They are in the field's world and of the size of its frames. `refuse` gets the error of each photograph that cannot
+    be read or placed.
     """
     if isinstance(photos, Path) and poses is None:
         files = lone_photographs(photos)
@@ -67,23 +54,9 @@ def read_frames(
             names = frame_names([file.name for file in files], photos)
             return _place(field, ledger, _without_known(field, names, files), refuse, progress)
     capture = photos if isinstance(photos, Capture) else _read_capture(field, photos, poses)
-    scene_from_capture = np.linalg.inv(field.source_from_scene) @ np.asarray(capture.source_from_scene)
-    moved = transform_poses(np.asarray(capture.cameras.world_to_camera), scene_from_capture)
-    cameras = replace(capture.cameras, world_to_camera=moved.astype(np.float32))
-    cameras = jax.tree.map(np.asarray, cameras)
-    rows = _without_known(field, capture.names, range(len(capture.names)))
-    frames = {}
-    for done, (name, t) in enumerate(rows.items()):
-        frame = _sized(field, np.asarray(capture.frames[t]), cameras[t])
-        if capture.ignored is not None:
-            frame = frame._replace(ignored=resize_mask(np.asarray(capture.ignored[t]), frame.camera))
-        if capture.depths is not None:
-            size, unit = frame.pixels.shape[1::-1], np.cbrt(np.linalg.det(scene_from_capture[:3, :3]))
-            depth = cv2.resize(np.asarray(capture.depths[t], np.float32), size, interpolation=cv2.INTER_NEAREST)
-            frame = frame._replace(depth=depth * np.float32(unit))
-        frames[name] = frame
-        progress(done + 1, len(rows))
-    return frames
+    rows = [*_without_known(field, capture.names, range(len(capture.names))).values()]
+    capture = move_capture(take_frames(capture, rows), field.source_from_scene)
+    return resize_capture(capture, resize_camera(capture.cameras, field.cameras.width, field.cameras.height))
 
 
 def _without_known(field: LanguageField, names: Sequence[str], items: Sequence[Any]) -> dict[str, Any]:
@@ -111,32 +84,25 @@ def _read_capture(field: LanguageField, photos: Path, poses: Path | None) -> Cap
     return build_capture(replace(posed, images=list(new.values())), size)
 
 
-def _sized(field: LanguageField, pixels: UInt8[np.ndarray, "h w 3"], camera: Camera) -> NewFrame:
-    """Brings a photograph to the size of the field's frames, each axis by its own factor."""
-    camera = resize_camera(camera, field.cameras.width, field.cameras.height)
-    return NewFrame(resize_frame(pixels, camera), camera)
-
-
 def _place(
     field: LanguageField,
     ledger: Ledger,
     files: Mapping[str, Path],
     refuse: Callable[[InputError], None],
     progress: Progress,
-) -> dict[str, NewFrame]:
+) -> Capture:
     """Finds the poses of photographs by the pictures of the ledger."""
     rows = [t for t, name in enumerate(field.names) if name in ledger.views]
-    cameras = jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras)
-    pictures = [decode_jpeg(ledger.views[field.names[t]].picture) for t in rows]
-    landmarks = Landmarks(field.gaussians, cameras, pictures)
-    side, frames = max(cameras.width, cameras.height), {}
+    views = jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras)
+    landmarks = Landmarks(field.gaussians, views, [decode_jpeg(ledger.views[field.names[t]].picture) for t in rows])
+    names, cameras, frames = [], [], []
     for done, (name, file) in enumerate(files.items()):
         try:
             photo = read_image(file)
         except InputError as error:
             refuse(error)
             continue
-        size = FrameOptions(long_side=side).size(photo.shape[1::-1])
+        size = FrameOptions(long_side=max(views.width, views.height)).size(photo.shape[1::-1])
         photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
         camera, inliers = find_pose(photo, landmarks)
         if camera is None:
@@ -144,28 +110,35 @@ def _place(
             remedy = "Photograph more of what the field shows, from nearer to its views, or give its pose (--poses)."
             refuse(InputError(file, problem, remedy=remedy))
         else:
-            frames[name] = _sized(field, photo, camera)
+            names.append(name)
+            cameras.append(resize_camera(camera, views.width, views.height))
+            frames.append(resize_frame(photo, cameras[-1]))
         progress(done + 1, len(files))
-    return frames
+    pixels = np.array(frames, np.uint8).reshape(-1, views.height, views.width, 3)
+    placed = jax.tree.map(lambda *columns: np.stack(columns), *cameras) if cameras else views[:0]
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(len(names), bool), None
+    return Capture(pixels, placed, *nothing, np.asarray(field.source_from_scene), tuple(names))
 
 
 def make_views(
     field: LanguageField,
-    frames: Mapping[str, NewFrame],
+    capture: Capture,
     embedder: Embedder,
     masks: Path | None,
     refuse: Callable[[InputError], None],
     progress: Progress,
+    things: Mapping[str, Bool[np.ndarray, "m h w"]],
 ) -> dict[str, LedgerView]:
-    """Labels new frames with the field's regions, embeds these, and lists their evidence.
+    """Labels new frames (`read_frames`) with the field's regions, embeds these, and lists their evidence.
 
-    `refuse` gets the error of each photograph that is unlike the scene.
+    `refuse` gets the error of each photograph that is unlike the scene. `things` has masks in some frames, by their
+    names, of what no view of the field saw.
     """
     options = parse_json(field.provenance).get("options", {})
     propose = ClassicalSegmenter()
     if masks is not None:
         size = field.cameras.height, field.cameras.width
-        read = load_proposals(masks, list(frames), size, level=options.get("level", "l"))[0]
+        read = load_proposals(masks, list(capture.names), size, level=options.get("level", "l"))[0]
         propose = lambda pixels, index: read(index)  # noqa: E731
     gaussians = jax.device_put(replace(field.gaussians, sh=None))  # as a run's, whose programs are compiled
     votes, views, opened = jax.tree.map(np.asarray, field.votes), {}, []
@@ -176,14 +149,15 @@ def make_views(
     owner = np.where(held & ~uncovered, strongest, -1)
     # Without masks from outside, leftovers that many views left without a region stay so.
     unknown = (owner < 0) if masks is not None else votes.views == 0
-    for done, (name, (pixels, camera, ignored, _, things)) in enumerate(frames.items()):
+    for t, name in enumerate(capture.names):
+        pixels, camera = np.asarray(capture.frames[t]), capture.cameras[t]
         list_labels = plan_evidence(gaussians, camera, centre_pixel_weight=options.get("centre_pixel_weight", 0.0))
-        proposals = propose(pixels, done)
-        if things is not None:
-            proposals = np.concatenate([things, proposals])  # first: what covers them too opens no other region
+        proposals = propose(pixels, t)
+        if name in things:  # first: what covers them too opens no other region
+            proposals = np.concatenate([things[name], proposals])
         view = frame_superpixels(pixels, proposals, list_labels)
-        progress(done + 1, len(frames))
-        if (like := _likeness(view, field, pixels)) < MIN_CORRELATION:
+        progress(t + 1, len(capture.names))
+        if name not in things and (like := _likeness(view, field, pixels)) < MIN_CORRELATION:
             problem = (
                 f"it does not look like the scene from its pose (correlation {like:.2f}, {MIN_CORRELATION} needed)"
             )
@@ -194,8 +168,8 @@ def make_views(
         shares = _region_shares(votes_of_rows(votes, seen), votes.num_regions, ~uncovered[seen])
         consensus = sparse.hstack([shares, *(part[seen] for part in opened)], "csr")
         labels, new = label_by_regions(view, owner[seen], consensus, unknown[seen], split=masks is not None)
-        if ignored is not None:
-            labels = np.where(ignored, IGNORED, labels)
+        if capture.ignored is not None:
+            labels = np.where(capture.ignored[t], IGNORED, labels)
         old = votes.num_regions + sum(part.shape[1] for part in opened)
         count = old + new
         evidence = list_labels(labels, count)
@@ -225,8 +199,9 @@ def _likeness(view: FrameSuperpixels, field: LanguageField, pixels: UInt8[np.nda
     photo = np.stack([np.bincount(labels, column) for column in flat.T], 1) / area[:, None]
     colours = np.clip(0.5 + C0 * np.asarray(field.gaussians.sh)[view.seen, 0], 0, 1)
     total = np.maximum(np.asarray(view.votes.sum(0)).ravel(), 1e-6)
-    pair = np.stack([photo, view.votes.T @ colours / total[:, None]]) * 1.0
-    weight = np.where(total >= 0.2 * area, area, 0.0)[:, None] / area.sum()
-    pair -= (pair * weight).sum(1, keepdims=True) / max(weight.sum(), 1e-9)
-    squares = (pair**2 * weight).sum((1, 2))
-    return float((pair[0] * pair[1] * weight).sum() / max(np.sqrt(squares.prod()), 1e-9))
+    shown = view.votes.T @ colours / total[:, None]
+    weight = np.where(total >= 0.2 * area, area, 0)
+    if not weight.any():
+        return 0.0
+    spread = sum(np.cov(*columns, aweights=weight, ddof=0) for columns in zip(photo.T, shown.T))
+    return float(spread[0, 1] / max(np.sqrt(spread[0, 0] * spread[1, 1]), 1e-9))

@@ -121,9 +121,9 @@ class SceneOptions:
       holdout: Every how many frames one is held out for measuring; 0 holds out no frame. By default those that the
         capture's own split sets aside are held out, or else every eighth.
       refine: When to correct camera poses and exposures by short fits before anything else. With auto, captures with
-        depth are corrected within half of the fit's time if depth makes the frames agree clearly better, or if that
-        lowers the error of training frames kept aside; captures without depth, and runs with --gaussians, stay as they
-        are. Held-out frames are aligned to the last of these fits, frozen.
+        depth are corrected within half of the fit's time if depth makes the frames agree clearly better. Captures
+        without depth, and runs with --gaussians, stay as they are. Held-out frames are aligned to the last of these
+        fits, frozen.
       steps: Number of optimisation steps of the photometric fit.
       minutes: Time limit of the photometric fit in minutes, at least 0.05. It replaces --steps, and the schedule makes
         the best of it on this machine.

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.fit.resize import resize_camera
 from jsecon.fit.triangulate import Features, detect_features, match_features
 from jsecon.read.captures.frames import same_aspect
+from jsecon.splat.points import back_project
 from jsecon.splat.render import render_depth, render_rgb
 from jsecon.types import Camera, Gaussians
 
@@ -45,7 +46,6 @@ class Landmarks:
     def __init__(self, gaussians: Gaussians, cameras: Camera, pictures: Sequence[UInt8[np.ndarray, "h w 3"]]):
         self.gaussians, self.cameras, self.pictures = gaussians, jax.tree.map(np.asarray, cameras), pictures
         self._views: dict[int, tuple[Features, np.ndarray]] = {}
-        self._thumbnails = np.stack([_thumbnail(picture) for picture in pictures])
 
     def _lens(self, width: int, height: int) -> Camera:
         """Guesses the lens of a photograph: the median one of the views, its centre only for the same aspect."""
@@ -57,8 +57,11 @@ class Landmarks:
         return Camera(poses, focal, focal, *np.array([width / 2, height / 2], np.float32), width=width, height=height)
 
     def _alike(self, photo: UInt8[np.ndarray, "h w 3"]) -> list[int]:
-        """Lists the views, those whose picture looks most like a photograph first."""
-        return np.argsort(-(self._thumbnails @ _thumbnail(photo)), kind="stable").tolist()
+        """Lists the views, those whose picture looks most like a photograph first: by the colours of 12x12 places."""
+        small = [cv2.resize(image, (12, 12), interpolation=cv2.INTER_AREA).ravel() for image in (photo, *self.pictures)]
+        with np.errstate(divide="ignore", invalid="ignore"):  # a picture of one colour is like none
+            alike = np.nan_to_num(np.corrcoef(small)[0, 1:])
+        return np.argsort(-alike, kind="stable").tolist()
 
     def _match(self, features: Features, t: int) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
         """Matches features with those of a view: the rays of the first, and their places in the world."""
@@ -112,13 +115,6 @@ def find_pose(photo: UInt8[np.ndarray, "h w 3"], landmarks: Landmarks) -> tuple[
     return _placed(lens, *refined), count
 
 
-def _thumbnail(picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " d"]:
-    """Returns colours of 12x12 places, without their mean and of unit length."""
-    small = cv2.resize(picture, (12, 12), interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
-    small -= small.mean()
-    return small / max(float(np.linalg.norm(small)), 1e-6)
-
-
 def _placed(lens: Camera, pose: Float[np.ndarray, "4 4"], zoom: float) -> Camera:
     fx, fy = np.float32(lens.fx * zoom), np.float32(lens.fy * zoom)
     return dataclasses.replace(lens, world_to_camera=pose.astype(np.float32), fx=fx, fy=fy)
@@ -133,9 +129,7 @@ def _places(
     x, y = np.clip(pixels.T.astype(int), 0, [[camera.width - 1], [camera.height - 1]])
     around = np.ones((3, 3), np.uint8)
     z, step = depth[y, x].astype(np.float64), (cv2.dilate(depth, around) - cv2.erode(depth, around))[y, x]
-    pose = np.asarray(camera.world_to_camera, np.float64)
-    places = (np.column_stack([rays, np.ones(len(rays))]) * z[:, None] - pose[:3, 3]) @ pose[:3, :3]
-    return places, (alpha[y, x] > 0.8) & (z > 0) & (step < 0.05 * z)
+    return back_project(camera, pixels[:, ::-1] - 0.5, z), (alpha[y, x] > 0.8) & (z > 0) & (step < 0.05 * z)
 
 
 def _refine(

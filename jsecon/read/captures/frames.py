@@ -1,4 +1,4 @@
-"""Records of a capture before its pixels are read: frames, their choice, names and rigid poses, on the host."""
+"""Frames of a capture, on the host: their records before pixels are read, choice, names, rigid poses and worlds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.lens import Lens
-from jsecon.types import UpAxis
+from jsecon.types import Capture, UpAxis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,3 +175,22 @@ def transform_poses(
     moved = np.asarray(poses, np.float64) @ np.linalg.inv(world)
     moved[..., :3, :] *= np.cbrt(np.linalg.det(world[:3, :3]))
     return moved
+
+
+def move_capture(capture: Capture, source_from_scene: Float[np.ndarray, "4 4"]) -> Capture:
+    """Moves the cameras and depths of a capture to another world of the same source."""
+    world = np.linalg.inv(np.asarray(source_from_scene, np.float64)) @ np.asarray(capture.source_from_scene)
+    cameras = jax.tree.map(np.asarray, capture.cameras)
+    poses = transform_poses(cameras.world_to_camera, world).astype(np.float32)
+    cameras = dataclasses.replace(cameras, world_to_camera=poses)
+    depths = None if capture.depths is None else capture.depths * np.float32(np.cbrt(np.linalg.det(world[:3, :3])))
+    return dataclasses.replace(capture, cameras=cameras, depths=depths, source_from_scene=np.asarray(source_from_scene))
+
+
+def take_frames(capture: Capture, rows: Sequence[int]) -> Capture:
+    """Takes some frames of a capture."""
+    arrays = capture.frames, capture.cameras, capture.held_out, capture.depths, capture.ignored
+    frames, cameras, held_out, depths, ignored = jax.tree.map(lambda column: np.asarray(column)[list(rows)], arrays)
+    columns = {"frames": frames, "cameras": cameras, "held_out": held_out, "depths": depths, "ignored": ignored}
+    files = tuple(capture.files[t] for t in rows) if capture.files else ()
+    return dataclasses.replace(capture, **columns, names=tuple(capture.names[t] for t in rows), files=files)
