@@ -85,7 +85,7 @@ def test_exact_poses_stay_and_frames_that_share_nothing_have_none():
 def test_frames_that_depth_aligns_need_no_proof_and_keep_it_where_no_time_is_left_for_a_probe():
     truth, given = in_a_corner(), {"key": jax.random.key(0), "visits": 1}
     alone, limited, whole = (refine_capture(moved(truth, 2.0, 1.0), max_fit_steps=n, **given) for n in (1.0, 1e9, None))
-    assert off(np.float64(alone.cameras.world_to_camera), truth)[0] < 0.5
+    assert off(np.float64(alone.cameras.world_to_camera), truth)[0] < 0.6
     assert same(whole, limited)
     other = dataclasses.replace(truth, depths=1.25 * truth.depths)  # another unit
     assert same(refine_capture(other, max_fit_steps=1.0, **given).cameras, truth.cameras)

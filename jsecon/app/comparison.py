@@ -87,8 +87,8 @@ def apply_changes(
 ) -> tuple[LanguageField, Ledger | None]:
     """Applies changes to their field, with a date: what moved moves, what is gone is absent, what is new is added.
 
-    Of which region a Gaussian is stays true, also if it moves. So the ledger grows only by frames that show something
-    new; the second result is None if it stays.
+    Of which region a Gaussian is stays true, also if it moves. So the ledger grows only by what is new; the second
+    result is None if it stays.
     """
     from jsecon.pipeline.new_frames import make_views  # late: questions to a field need none of it
 
@@ -118,7 +118,9 @@ def apply_changes(
     capture = dataclasses.replace(capture, names=tuple(names[len(field.names) :]))
     shown = dict(zip(capture.names, masks.values()))
     grown = add_unseen(field, things)
-    views = make_views(grown, capture, embedder, None, lambda error: None, lambda done, total: None, shown)
+    views = make_views(
+        grown, capture, embedder, None, lambda error: None, lambda done, total: None, shown, field.gaussians.count
+    )
     grown, known = add_views(grown, Ledger(known.num_regions, known.views), views)
     return record_new(field, grown, things, new), known
 

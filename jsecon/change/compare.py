@@ -6,7 +6,6 @@ A pixel may be lighter or darker by a factor, at a small cost, because light and
 
 import cv2
 import numpy as np
-import scipy  # loads scipy.optimize on its first use
 from jaxtyping import Bool, Float, Float32
 
 COLOUR_STEP = 22.0
@@ -25,17 +24,19 @@ def fit_exposure(
     The fit weighs pixels by how well they agree (Cauchy), so that what changed does not count.
     """
     known = known & (photo > 0.01).all(-1) & (photo < 0.99).all(-1)
-    every = known.sum() // 4000 + 1  # so many pixels are enough
-    source, target = photo[known][::every].astype(np.float64), render[known][::every]
-    if len(source) < 64:
+    if known.sum() < 64:
         return photo
-    start = np.stack([np.median(target, 0) / np.maximum(np.median(source, 0), 1e-3), np.zeros(3)])
-
-    def errors(x: np.ndarray) -> np.ndarray:
-        return (x[:3] * source + x[3:] - target).ravel()
-
-    fitted = scipy.optimize.least_squares(errors, start.ravel(), loss="cauchy", f_scale=0.04).x
-    return np.clip(photo * fitted[:3] + fitted[3:], 0, 1.5).astype(np.float32)
+    source, target = photo[known].astype(np.float64), render[known].astype(np.float64)
+    gain, offset = np.median(target, 0) / np.maximum(np.median(source, 0), 1e-3), np.zeros(3)
+    for _ in range(12):
+        error = source * gain + offset - target
+        weight = 1 / (1 + (error**2).sum(1) / 0.04**2)
+        mean, middle = (np.average(values, axis=0, weights=weight) for values in (source, target))
+        spread = np.average((source - mean) ** 2, axis=0, weights=weight)
+        both = np.average((source - mean) * (target - middle), axis=0, weights=weight)
+        gain = np.clip((both + 1e-4 * gain) / (spread + 1e-4), 0.2, 5.0)
+        offset = middle - gain * mean
+    return np.clip(photo * gain + offset, 0, 1.5).astype(np.float32)
 
 
 def find_shift(

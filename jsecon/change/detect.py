@@ -365,7 +365,6 @@ class _Search:
         number, image, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
         down = -(np.asarray(view.camera.world_to_camera, np.float64)[:3, :3] @ self.up)[:2]
         height, width = mask.shape
-        surface = view.z if view.depth is None else np.where(view.depth > 0, view.depth, view.z)
         bare = np.zeros(mask.shape, bool) if view.depth is None else depth_cost(view.depth, view.z) > 0.3
         result = []
         for n in range(1, number):
@@ -375,11 +374,19 @@ class _Search:
             cut = left == 0 or top == 0 or left + across == width or top + tall == height
             if cut or area < MIN_PIXELS or radius < MIN_RADIUS or bare[inside].mean() > 0.5:  # what went left it bare
                 continue
-            rows, columns = np.nonzero(inside)
-            along = down[0] * columns + down[1] * rows
-            low = along >= np.quantile(along, 0.95)
-            z = float(np.median(surface[rows[low], columns[low]]))
-            contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
+            measured = np.zeros_like(inside) if view.depth is None else inside & (view.depth > 0)
+            if view.depth is not None and measured.any():
+                z = float(np.quantile(view.depth[measured], 0.5, method="nearest"))
+                measured &= np.abs(view.depth - z) <= z * np.sqrt(area) / float(view.camera.fx)  # not what is behind it
+                surface = back_project(view.camera, np.argwhere(measured), view.depth[measured])
+                contact = np.median(surface, axis=0)
+                contact += (np.quantile(surface @ self.up, 0.05) - contact @ self.up) * self.up
+            else:
+                rows, columns = np.nonzero(inside)
+                along = down[0] * columns + down[1] * rows
+                low = along >= np.quantile(along, 0.95)
+                z = float(np.median(view.z[rows[low], columns[low]]))
+                contact = back_project(view.camera, np.array([[rows[low].mean(), columns[low].mean()]]), z)[0]
             size = z * np.sqrt(area) / float(view.camera.fx)
             ahead = contact - np.asarray(view.camera.centres, np.float64)
             ahead -= (ahead @ self.up) * self.up
