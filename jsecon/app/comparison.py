@@ -78,7 +78,8 @@ def find_changes(field: LanguageField, listed: Catalogue, capture: Capture) -> C
     things = np.append(~listed.surroundings, False)
     labels = np.where(things[listed.labels], listed.labels, -1)
     up = np.array(field_up(field).axis)
-    found = object_changes(field.gaussians, labels, capture.frames, capture.cameras, capture.depths, up=up)
+    frames, depths = np.asarray(capture.frames), None if capture.depths is None else np.asarray(capture.depths)
+    found = object_changes(field.gaussians, labels, frames, capture.cameras, depths, up=up)
     return Changes(field, listed, capture, tuple(found))
 
 

@@ -218,11 +218,13 @@ def _draw_plan(changes: Changes) -> np.ndarray:
     eye = np.append((low + high)[:2] / 2, low[2] - away)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, -eye
-    camera = Camera(np.float32(pose), *np.float32([scale * away, scale * away, *size / 2]), *size.tolist())
+    lens = np.array([scale * away, scale * away, *size / 2], np.float32)
+    camera = Camera(pose.astype(np.float32), *lens, *size.tolist())
     image = pictures.render_picture(hide(field.gaussians, means[:, 2] < low[2]), camera)  # without ceilings
     image = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     for change, pixels in zip(changes.found, np.rint(2 * scale * (ends[..., :2] - eye[:2]) + size).astype(int)):
         if change.kind in _COLOURS:
-            cv2.arrowedLine(image, *pixels.tolist(), _COLOURS[change.kind], 3, cv2.LINE_AA, tipLength=0.12)
-            cv2.circle(image, pixels[1].tolist(), 14, _COLOURS[change.kind], 3, cv2.LINE_AA)
+            start, end = pixels.tolist()
+            cv2.arrowedLine(image, start, end, _COLOURS[change.kind], 3, cv2.LINE_AA, tipLength=0.12)
+            cv2.circle(image, end, 14, _COLOURS[change.kind], 3, cv2.LINE_AA)
     return image

@@ -257,11 +257,11 @@ class Scene:
                 if not views:
                     raise errors.pop()
                 capture = take_frames(capture, [t for t, name in enumerate(capture.names) if name in views])
-                field, masks = self._add_new_things(capture)
-                if masks:
-                    views = make_views(field, capture, embedder, mask_folder, refuse, progress, masks)
+                field, things = self._add_new_things(capture)
+                if things:
+                    views = make_views(field, capture, embedder, mask_folder, refuse, progress, things)
             with console.progress("votes"):
-                ledger = Ledger(ledger.num_regions, ledger.views) if masks else summed.result()
+                ledger = Ledger(ledger.num_regions, ledger.views) if things else summed.result()
                 field, grown = add_views(field, ledger, views)
                 return self._with(field, lambda: grown)
 

@@ -210,5 +210,5 @@ def _likeness(view: FrameSuperpixels, field: LanguageField, pixels: UInt8[np.nda
     weight = np.where(total >= 0.2 * area, area, 0)
     if not weight.any():
         return 0.0
-    spread = sum(np.cov(*columns, aweights=weight, ddof=0) for columns in zip(photo.T, shown.T))
+    spread = np.sum([np.cov(*columns, aweights=weight, ddof=0) for columns in zip(photo.T, shown.T)], axis=0)
     return float(spread[0, 1] / max(np.sqrt(spread[0, 0] * spread[1, 1]), 1e-9))

@@ -60,8 +60,8 @@ class Landmarks:
         """Lists the views, those whose picture looks most like a photograph first: by the colours of 12x12 places."""
         small = [cv2.resize(image, (12, 12), interpolation=cv2.INTER_AREA).ravel() for image in (photo, *self.pictures)]
         with np.errstate(divide="ignore", invalid="ignore"):  # a picture of one colour is like none
-            alike = np.nan_to_num(np.corrcoef(small)[0, 1:])
-        return np.argsort(-alike, kind="stable").tolist()
+            alike = np.nan_to_num(np.atleast_2d(np.corrcoef(small)))
+        return np.argsort(-alike[0, 1:], kind="stable").tolist()
 
     def _match(self, features: Features, t: int) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
         """Matches features with those of a view: the rays of the first, and their places in the world."""

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import InputError
 from jsecon.numerics import is_finite_and_bounded
 from jsecon.read.captures.lens import Lens
-from jsecon.types import Capture, UpAxis
+from jsecon.types import Array, Capture, UpAxis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,7 +177,7 @@ def transform_poses(
     return moved
 
 
-def move_capture(capture: Capture, source_from_scene: Float[np.ndarray, "4 4"]) -> Capture:
+def move_capture(capture: Capture, source_from_scene: Float[Array, "4 4"]) -> Capture:
     """Moves the cameras and depths of a capture to another world of the same source."""
     world = np.linalg.inv(np.asarray(source_from_scene, np.float64)) @ np.asarray(capture.source_from_scene)
     cameras = jax.tree.map(np.asarray, capture.cameras)
