@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change, object_changes
-from jsecon.change.history import add_unseen, dates, move_object, record_new, remove_object
+from jsecon.change.history import add_objects, dates, move_object, remove_object
 from jsecon.errors import InputError
-from jsecon.field.ledger import Ledger, add_views
-from jsecon.fit.resize import resize_camera, resize_capture, resize_mask, shrink_cameras
-from jsecon.read.captures.frames import evenly_spaced, move_capture, take_frames
+from jsecon.field.evidence import ViewEvidence, pack_evidence
+from jsecon.field.ledger import Ledger, LedgerView, camera_row
+from jsecon.fit.resize import resize_camera, resize_capture, resize_frame, resize_mask, shrink_cameras
+from jsecon.read.captures.frames import evenly_spaced, move_capture
+from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import back_project, gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
@@ -91,9 +93,8 @@ def apply_changes(
     Of which region a Gaussian is stays true, also if it moves. So the ledger grows only by what is new; the second
     result is None if it stays.
     """
-    from jsecon.pipeline.new_frames import make_views  # late: questions to a field need none of it
-
-    field, listed, new = changes.field, changes.catalogue, []
+    field, listed = changes.field, changes.catalogue
+    new, descriptions = [change for change in changes.found if change.kind == "new"], []
     if date < (last := dates(field)[-1]):
         raise InputError("--date", f"{date} is before the last change of the field, {last}", remedy="Check it.")
     for change, record in zip(changes.found, changes.records()):
@@ -105,25 +106,40 @@ def apply_changes(
         elif change.kind == "look":
             field = remove_object(field, mask & False, (), description)
         elif change.kind == "new":
-            new.append(description)
+            descriptions.append(description)
     things, masks = new_things(changes, field.cameras)
     if not things:
         return field, None
-    known = ledger()  # which only what is new needs
-    capture, names = take_frames(changes.capture, list(masks)), list(field.names)
-    for name in capture.names:
-        while name in names:
+    first = np.cumsum([field.gaussians.count, *(thing.count for thing in things)])
+    views: dict[str, LedgerView] = {}
+    for t, mask in masks.items():
+        shown = [k for k, change in enumerate(new) if t in change.frames]
+        rows = np.concatenate([np.arange(first[k], first[k + 1]) for k in shown])
+        regions = np.repeat(field.regions.count + np.array(shown), [things[k].count for k in shown])
+        name = changes.capture.names[t]
+        while name in field.names or name in views:
             name += f"_{date}"
-        names.append(name)
-    capture = resize_capture(capture, resize_camera(capture.cameras, field.cameras.width, field.cameras.height))
-    capture = dataclasses.replace(capture, names=tuple(names[len(field.names) :]))
-    shown = dict(zip(capture.names, masks.values()))
-    grown = add_unseen(field, things)
-    views = make_views(
-        grown, capture, embedder, None, lambda error: None, lambda done, total: None, shown, field.gaussians.count
-    )
-    grown, known = add_views(grown, Ledger(known.num_regions, known.views), views)
-    return record_new(field, grown, things, new), known
+        views[name] = _new_view(changes, embedder, t, mask, rows, regions)
+    return add_objects(field, ledger(), things, views, descriptions)
+
+
+def _new_view(
+    changes: Changes, embedder: Embedder, t: int, masks: np.ndarray, rows: np.ndarray, regions: np.ndarray
+) -> LedgerView:
+    """What a frame contributes that shows new things: their masks (M, H, W), Gaussians, and the regions of these.
+
+    Each Gaussian has a weight of 4 px in it, and 0.9 at its strongest pixel.
+    """
+    size, frame = changes.field.cameras, np.asarray(changes.capture.frames[t])
+    camera = resize_camera(changes.capture.cameras[t], size.width, size.height)
+    frame = resize_frame(frame, camera)
+    weights, peaks = np.full(len(rows), 4.0, np.float32), np.full(len(rows), 0.9, np.float32)
+    starts = np.arange(len(rows) + 1, dtype=np.int32)
+    evidence = ViewEvidence(rows.astype(np.int32), starts, regions.astype(np.int32), weights, peaks)
+    pixels = np.stack([np.unique(regions), masks.sum((1, 2))]).astype(np.int32)
+    embeddings = np.asarray(embedder.embed_regions(frame, masks), np.float32)
+    packed = pack_evidence(evidence, int(regions.max()) + 1)
+    return LedgerView(packed, pixels, pixels[0], embeddings, camera_row(camera), encode_jpeg(frame))
 
 
 def new_things(changes: Changes, cameras: Camera) -> tuple[list[Gaussians], dict[int, np.ndarray]]:

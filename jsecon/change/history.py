@@ -7,7 +7,7 @@ its Gaussians nor its regions answer a query; what is new has Gaussians and a re
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError
+from jsecon.field.ledger import Ledger, LedgerView, add_views
 from jsecon.files import parse_json
 from jsecon.fit.growth import pad_rows
 from jsecon.query.render import HIDDEN_LOGIT
@@ -99,18 +100,25 @@ def add_unseen(field: LanguageField, things: Sequence[Gaussians]) -> LanguageFie
     return dataclasses.replace(field, gaussians=gaussians, votes=votes, leaf=leaf)
 
 
-def record_new(
-    before: LanguageField, field: LanguageField, things: Sequence[Gaussians], descriptions: Sequence[dict[str, Any]]
-) -> LanguageField:
-    """Keeps in the history that things are new, which `add_unseen` added to a field and views have shown since."""
-    first, strongest = before.gaussians.count, np.asarray(field.votes.regions)[:, 0]
-    for thing, description in zip(things, descriptions):
+def add_objects(
+    field: LanguageField,
+    ledger: Ledger,
+    things: Sequence[Gaussians],
+    views: Mapping[str, LedgerView],
+    descriptions: Sequence[dict[str, Any]],
+) -> tuple[LanguageField, Ledger]:
+    """Adds things to a field and its ledger: Gaussians of the field's world, and new views that show them.
+
+    Each gets the next region, of which `views` speak already, and Gaussians behind those of the field.
+    """
+    region, first = field.regions.count, field.gaussians.count
+    field, ledger = add_views(add_unseen(field, things), Ledger(ledger.num_regions, ledger.views), views)
+    for number, (thing, description) in enumerate(zip(things, descriptions), region):
         rows = np.arange(first, first + thing.count)
         first += thing.count
-        regions = np.unique(strongest[rows][strongest[rows] >= before.regions.count])
-        named = description | {"region": int(regions[0]) if len(regions) else None}
-        field = _with_event(field, _absent(_event(field, rows, regions, named)))
-    return field
+        event = _event(field, rows, np.array([number]), description | {"region": number})
+        field = _with_event(field, _absent(event))
+    return field, ledger
 
 
 def dates(field: LanguageField) -> list[str]:

@@ -79,7 +79,7 @@ class ViewEvidence(NamedTuple):
     overflow: int = 0
     """Pairs beyond the capacity; 0 if the list is exact."""
 
-    def of_rows(self, rows: slice) -> "ViewEvidence":
+    def _of_rows(self, rows: slice) -> "ViewEvidence":
         """Takes the Gaussians of a slice, which are then counted from its start."""
         first, last = np.searchsorted(self.gaussians, [rows.start, rows.stop])
         starts = np.asarray(self.starts[first : last + 1])
@@ -495,7 +495,7 @@ def _sum_blocks(views: Sequence[ViewEvidence], count: int, num_regions: int, by_
     size = max(_MAX_ENTRIES // max(len(views), num_regions, 1), 1)
     for first in range(0, max(count, 1), size):
         rows = slice(first, min(first + size, count))
-        yield _sum_rows([view.of_rows(rows) for view in views], rows, num_regions, by_view)
+        yield _sum_rows([view._of_rows(rows) for view in views], rows, num_regions, by_view)
 
 
 def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_view: bool) -> EvidenceSum:

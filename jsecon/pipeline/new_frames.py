@@ -128,13 +128,11 @@ def make_views(
     refuse: Callable[[InputError], None],
     progress: Progress,
     things: Mapping[str, Bool[np.ndarray, "m h w"]],
-    first: int = 0,
 ) -> dict[str, LedgerView]:
     """Labels new frames (`read_frames`) with the field's regions, embeds these, and lists their evidence.
 
     `refuse` gets the error of each photograph that is unlike the scene. `things` has masks in some frames, by their
-    names, of what no view of the field saw. With `first` above 0 only Gaussians from that row on get evidence, and only
-    of new regions: the others keep their votes.
+    names, of what no view of the field saw.
     """
     options = parse_json(field.provenance).get("options", {})
     propose = ClassicalSegmenter()
@@ -174,12 +172,7 @@ def make_views(
             labels = np.where(capture.ignored[t], IGNORED, labels)
         old = votes.num_regions + sum(part.shape[1] for part in opened)
         count = old + new
-        if first:
-            labels = np.where(labels >= votes.num_regions, labels, IGNORED)
         evidence = list_labels(labels, count)
-        if first:
-            evidence = evidence.of_rows(slice(first, len(owner)))
-            evidence = evidence._replace(gaussians=evidence.gaussians + np.int32(first))
         if new:  # the next frame may show them too
             own = evidence.matrix(len(owner), count)
             opened.append(own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9)).tocsr())
