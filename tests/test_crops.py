@@ -1,4 +1,4 @@
-"""Views of regions that are embedded: the choice against loops, and what it is chosen by against single pixels."""
+"""Views of regions that are embedded: the choice and their number against loops, and what both go by."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.field.regions import choose_crops, crop_geometry
-from jsecon.types import Camera
+from jsecon.field.regions import choose_crops, crop_geometry, views_needed
+from jsecon.types import Camera, Regions
 
 
 def chosen_by_loops(pixels, cut, directions, most):
@@ -37,6 +37,27 @@ def test_the_choice_equals_loops_and_grows_by_one_view_at_a_time(seed, most):
         assert set(np.flatnonzero(row)) == set(chosen_by_loops(*region, most))
     assert (found <= choose_crops(pixels, cut, directions, most + 1)).all()
     np.testing.assert_array_equal(choose_crops(pixels, cut, directions, 6), pixels > 0)
+    of_each = choose_crops(pixels, cut, directions, np.array([most, 0, 2, 6]))
+    for row, most_of_one, *region in zip(of_each, (most, 0, 2, 6), pixels, cut, directions):
+        assert set(np.flatnonzero(row)) == set(chosen_by_loops(*region, most_of_one))
+
+
+def test_a_region_needs_as_many_views_as_its_views_scatter():
+    rng = np.random.default_rng(0)
+    places = np.array([(r, t) for r in (0, 1, 2, 4) for t in range(1 if r == 2 else 6)], np.int32)
+    spread = np.array([0.01, 0.2, 0.3, 0, 0.05])[places[:, 0]]
+    rows = np.eye(5, 40)[places[:, 0]] + spread[:, None] * rng.normal(size=(len(places), 40))
+    regions = Regions(np.zeros((5, 40)), np.ones((5, 6), np.int32), places, rows)
+    means = {r: rows[places[:, 0] == r].mean(0) for r in (0, 1, 2, 4)}
+    apart = np.mean([np.sum((mean - np.mean(list(means.values()), axis=0)) ** 2) for mean in means.values()])
+    variance = [np.var(rows[places[:, 0] == r], axis=0, ddof=1).sum() for r in (0, 1, 4)]
+    needed = views_needed(regions, scatter=0.1)
+    np.testing.assert_array_equal(needed[[0, 1, 4]], np.ceil(np.array(variance) / (0.1 * apart)))
+    assert needed[0] == 1
+    assert needed[1] > 6
+    assert not needed[[2, 3]].any()  # one view, and none, say nothing of scatter
+    alone = Regions(np.zeros((1, 40)), np.ones((1, 6)), places[:6], rows[:6])
+    np.testing.assert_array_equal(views_needed(alone), [6])  # nothing to be told from
 
 
 def test_geometry_of_regions_by_their_pixels():

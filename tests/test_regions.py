@@ -1,8 +1,9 @@
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from jsecon.field.regions import region_embeddings
+from jsecon.field.regions import join_views, region_embeddings
 
 
 def embed(frame, masks):
@@ -70,6 +71,10 @@ def test_views_that_are_not_chosen_are_not_embedded_and_their_pixels_still_count
         found.pixel_counts, region_embeddings(frames, labels, embed, num_regions=7).pixel_counts
     )
     assert sum(crops) == (views & (found.pixel_counts > 0)).sum()
+    rest = region_embeddings(frames, labels, embed, num_regions=7, views=~views)
+    every = region_embeddings(frames, labels, embed, num_regions=7)
+    for joined, expected in zip(jax.tree.leaves(join_views(rest, found)), jax.tree.leaves(every), strict=True):
+        np.testing.assert_array_equal(joined, expected)
     with pytest.raises(ValueError, match="views"):
         region_embeddings(frames, labels, embed, views=views)
 

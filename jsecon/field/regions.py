@@ -1,14 +1,15 @@
 """One embedding per region: the mean of its views' embeddings, weighted by its pixels in each view (paper: phi_bar).
 
 `choose_crops` chooses which views of each region are embedded: a few that show most of it, uncut, from different
-directions. An encoder needs a fifth of a second for each view (SigLIP 2, two cores), and the views of one object share
-most of its errors (docs/results/vision.md).
+directions. An encoder needs a fifth of a second for each view (SigLIP 2, two cores), and the views of one object mostly
+share its errors. `views_needed` finds the regions whose views do not (docs/results/vision.md).
 """
 
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from scipy import sparse
 
 from jsecon.errors import require_shape
 from jsecon.numerics import array_module, inline_jit, normalize, require_labels
@@ -20,6 +21,10 @@ ALIKE_THRESHOLD = 0.9
 twice, such as a track that broke. Over all pairs of simulated CLIP (medium and high noise, errors that views share) and
 of colours, all that it joins are one object. On real words (ConSE, replica_apartment_0) it joins 0.008 of the pairs, of
 which 0.36 are of one class; a cosine of 0.95 of the embeddings themselves joins 0.027, of which 0.25 are."""
+
+SCATTER = 0.1
+"""Largest error of a region's embedding that its views may leave, as a squared distance over that of a region from the
+mean region. Chosen on twins of seed 71 and on apc_bin: docs/results/vision.md."""
 
 
 def region_embeddings(
@@ -70,22 +75,53 @@ def region_embeddings(
             masks = labels[t][None] == seen[:, None, None]
             yield np.asarray(embed(frames[t], masks), np.float32) if len(seen) else None
 
-    total: np.ndarray | None = None
     places, single = [np.zeros((0, 2), np.int32)], []
     for t, rows in enumerate(map_over_processes(len(labels), embed_frames, progress)):
         if rows is not None:
             seen = np.flatnonzero(embedded[:, t])
             require_shape("embed", rows, (len(seen), "E"), "An embedder returns one row per mask.")
-            total = np.zeros((count, rows.shape[1])) if total is None else total
-            total[seen] += pixels[seen, t, None] * rows.astype(np.float64)
             places.append(np.stack([seen, np.full(len(seen), t)], axis=1).astype(np.int32))
             single.append(rows)
-    if not len(labels):
-        total = np.zeros((count, 0))
-    elif total is None:  # without a label the embedder alone knows E
-        total = np.zeros((count, np.asarray(embed(frames[0], np.zeros((1, *labels.shape[1:]), bool))).shape[1]))
-    rows = np.concatenate([np.zeros((0, total.shape[1]), np.float32), *single])
-    return Regions(unit_rows(total), pixels, np.concatenate(places), rows)
+    if not single:  # without a label the embedder alone knows E
+        rows = embed(frames[0], np.zeros((1, *labels.shape[1:]), bool)) if len(labels) else np.zeros((1, 0))
+        single.append(np.zeros((0, np.shape(rows)[1]), np.float32))
+    return _mean_of_views(pixels, np.concatenate(places), np.concatenate(single))
+
+
+def _mean_of_views(
+    pixels: Int[np.ndarray, "r t"], places: Int[np.ndarray, "c 2"], rows: Float[np.ndarray, "c e"]
+) -> Regions:
+    region, view = places.T
+    weights = sparse.csr_array((pixels[region, view], (region, np.arange(len(rows)))), (len(pixels), len(rows)))
+    return Regions(unit_rows(weights @ rows.astype(np.float64)), pixels, places, rows)
+
+
+def join_views(first: Regions, second: Regions) -> Regions:
+    """Joins two `region_embeddings` of the same labels by different views: the same as by all of them at once."""
+    places = np.concatenate([first.embedded, second.embedded])
+    order = np.lexsort(places.T)
+    rows = np.concatenate([first.view_embeddings, second.view_embeddings])
+    return _mean_of_views(first.pixel_counts, places[order], rows[order])
+
+
+def views_needed(regions: Regions, *, scatter: float = SCATTER) -> Int[np.ndarray, " r"]:
+    """Computes how many views each of R regions needs, from the scatter of those that are embedded.
+
+        s_r / n <= scatter mean_q |m_q - m|^2
+
+    with the unbiased variance s_r of the views' embeddings of a region, their mean m_r, and the mean m of these means:
+    the error of a mean of n views is s_r / n. A region with fewer than two embedded views needs no more.
+    """
+    rows = np.asarray(regions.view_embeddings, np.float64)
+    known = (rows != 0).any(axis=1)
+    rows, region = rows[known], regions.embedded[known, 0]
+    gather = sparse.csr_array((np.ones(len(rows)), (region, np.arange(len(rows)))), (regions.count, len(rows)))
+    count = gather.sum(axis=1)
+    means = (gather @ rows) / np.maximum(count, 1)[:, None]
+    variance = (gather @ ((rows - means[region]) ** 2).sum(axis=1)) / np.maximum(count - 1, 1)
+    means = means[count > 0]
+    apart = ((means - means.sum(axis=0) / max(len(means), 1)) ** 2).sum() / max(len(means), 1)
+    return np.ceil(variance / (scatter * apart)).astype(np.int64) if apart > 0 else count.astype(np.int64)
 
 
 def crop_geometry(
@@ -121,7 +157,7 @@ def choose_crops(
     pixels: Int[np.ndarray, "r t"],
     cut: Float[np.ndarray, "r t"],
     directions: Float[np.ndarray, "r t 3"],
-    most: int,
+    most: int | Int[np.ndarray, " r"],
 ) -> Bool[np.ndarray, "r t"]:
     """Chooses at most `most` views of each region, one after the other, each time the one of the largest value.
 
@@ -134,14 +170,14 @@ def choose_crops(
       pixels: Pixels of R regions in T views.
       cut: How much the border cuts off, 0 to 1.
       directions: Unit vectors.
-      most: Largest number of views.
+      most: Largest number of views, of all regions or of each.
     """
     value = np.sqrt(pixels) * (1 - cut / 2)
     nearness = np.zeros(pixels.shape)
     chosen = np.zeros(pixels.shape, bool)
     every = np.arange(len(pixels))
-    for _ in range(min(most, pixels.shape[1])):
-        gain = np.where(chosen, 0.0, value * (1 - nearness / 2))
+    for n in range(min(np.max(most, initial=0), pixels.shape[1])):
+        gain = np.where(chosen | (np.asarray(most)[..., None] <= n), 0.0, value * (1 - nearness / 2))
         best = gain.argmax(1)
         chosen[every, best] |= gain[every, best] > 0
         cosines = np.einsum("rtj,rj->rt", directions, directions[every, best])

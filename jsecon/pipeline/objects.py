@@ -17,7 +17,7 @@ from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
-from jsecon.field.regions import choose_crops, crop_geometry, region_embeddings
+from jsecon.field.regions import choose_crops, crop_geometry, join_views, region_embeddings, views_needed
 from jsecon.fit.start import points_from_depth
 from jsecon.networks.hub import model_name
 from jsecon.paper.algorithm1 import masklets
@@ -89,7 +89,7 @@ def _plan_labels(context: RunContext) -> Stage:
 def _plan_regions(context: RunContext) -> list[Stage]:
     """Plans an embedding of each region, and of each part that the tree of objects has."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
-    how = f"embedded by {embedder!r} in at most {options.crops} views each, weighted by pixels"
+    how = f"embedded by {embedder!r} in {options.crops} views each, or more where these scatter, weighted by pixels"
     key_options = {"embedder": embedder} | context.key_options("crops")
     stages = [Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)]
     if options.masks is None and options.tracker is None:
@@ -254,18 +254,25 @@ def _require_regions(labels: np.ndarray, where: str) -> None:
 
 
 def _embed_objects(stage: StageInput) -> StageResult:
-    """Embeds each region by the embedder of the run, in few views."""
+    """Embeds each region by the embedder of the run, in few views, and then in more where these scatter."""
     context, labels = stage.context, stage.results.objects.labels
     view = _TrainingView(stage.results.load, context.options, stage.results.objects.frames)
-    embed = context.models.embedder.embed_regions
-    pixels, cut, directions = crop_geometry(labels, view.cameras, int(labels.max()) + 1)
-    chosen = choose_crops(pixels, cut, directions, context.options.crops)
-    embedded = region_embeddings(view.frames, labels, embed, views=chosen, progress=stage.progress)
+    geometry = crop_geometry(labels, view.cameras, int(labels.max()) + 1)
+
+    def embed(views):
+        how = {"views": views, "progress": stage.progress}
+        return region_embeddings(view.frames, labels, context.models.embedder.embed_regions, **how)
+
+    chosen = choose_crops(*geometry, context.options.crops)
+    embedded = embed(chosen)
+    more = choose_crops(*geometry, np.maximum(views_needed(embedded), context.options.crops)) & ~chosen
+    if more.any():
+        embedded = join_views(embedded, embed(more))
     context.models.close()
-    kept, total = np.count_nonzero(chosen), np.count_nonzero(pixels)
+    kept, total = len(embedded.embedded), np.count_nonzero(geometry[0])
     if kept == total:
         return StageResult(embedded)
-    why = f"a region is embedded in at most {context.options.crops} views (--crops)"
+    why = f"{context.options.crops} views of a region (--crops), or as many more as its views scatter"
     return StageResult(embedded, notes=(f"{kept} of {total} crops embedded: {why}",))
 
 

@@ -188,8 +188,8 @@ class ModelOptions:
         Gaussians, or a SAM 2 model: a name (sam2, edgetam), hub:owner/name, or a folder.
       embedder: CLIP model for regions and texts, instead of colours: a name (clip, siglip2, mobileclip),
         hub:owner/name, or a folder.
-      crops: Maximum number of views in which a region is embedded: those that show most of it, not cut off by the
-        frame's border, from different directions. Parts of objects take at most two.
+      crops: Number of views in which a region is embedded: those that show most of it, not cut off by the frame's
+        border, from different directions. A region whose views scatter takes more, a part of an object at most two.
       vision_frames: Maximum number of training frames in which masks are found and embedded; the fit uses all. A
         segmenter takes those that show most of the scene first, and ends where a further one adds less than 1 %. Other
         masks, and a tracker, take evenly spaced frames, by default all.
