@@ -80,7 +80,7 @@ def fresh_of(console):
 
 def test_regions_are_embedded_in_few_views_and_their_pixels_count_in_all(seen, tmp_path):
     run, folder, console = seen
-    assert "in at most 5 views each" in console.planned["regions"].why
+    assert "in 5 views each" in console.planned["regions"].why
     shutil.copytree(folder / "cache", tmp_path / "out" / "cache")
     single, console = again(run, tmp_path / "out", crops=1)
     assert fresh_of(console) == {"regions", "parts"}

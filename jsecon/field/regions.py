@@ -98,10 +98,12 @@ def _mean_of_views(
 
 def join_views(first: Regions, second: Regions) -> Regions:
     """Joins two `region_embeddings` of the same labels by different views: the same as by all of them at once."""
-    places = np.concatenate([first.embedded, second.embedded])
+    places, rows = (
+        np.concatenate([np.asarray(getattr(regions, name)) for regions in (first, second)])
+        for name in ("embedded", "view_embeddings")
+    )
     order = np.lexsort(places.T)
-    rows = np.concatenate([first.view_embeddings, second.view_embeddings])
-    return _mean_of_views(first.pixel_counts, places[order], rows[order])
+    return _mean_of_views(np.asarray(first.pixel_counts), places[order], rows[order])
 
 
 def views_needed(regions: Regions, *, scatter: float = SCATTER) -> Int[np.ndarray, " r"]:
@@ -114,7 +116,7 @@ def views_needed(regions: Regions, *, scatter: float = SCATTER) -> Int[np.ndarra
     """
     rows = np.asarray(regions.view_embeddings, np.float64)
     known = (rows != 0).any(axis=1)
-    rows, region = rows[known], regions.embedded[known, 0]
+    rows, region = rows[known], np.asarray(regions.embedded)[known, 0]
     gather = sparse.csr_array((np.ones(len(rows)), (region, np.arange(len(rows)))), (regions.count, len(rows)))
     count = gather.sum(axis=1)
     means = (gather @ rows) / np.maximum(count, 1)[:, None]

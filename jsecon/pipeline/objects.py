@@ -269,7 +269,7 @@ def _embed_objects(stage: StageInput) -> StageResult:
     if more.any():
         embedded = join_views(embedded, embed(more))
     context.models.close()
-    kept, total = len(embedded.embedded), np.count_nonzero(geometry[0])
+    kept, total = np.count_nonzero(chosen | more), np.count_nonzero(geometry[0])
     if kept == total:
         return StageResult(embedded)
     why = f"{context.options.crops} views of a region (--crops), or as many more as its views scatter"
