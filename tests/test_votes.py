@@ -99,27 +99,6 @@ def test_inside_a_trace_they_are_the_same_also_under_vmap(cast, scene, cameras, 
         np.testing.assert_array_equal(inside.views, cast.views)
 
 
-def test_they_have_the_derivative_of_the_twins_weights(scene, cameras, labels):
-    """Along a direction, of the votes of some regions, against central differences in float64."""
-    pair, some = cameras[:1], np.where(labels[2:3] == IGNORED, IGNORED, labels[1:2])
-    rng = np.random.default_rng(3)
-    columns, weight = {name: getattr(scene, name) for name in ("opacity_logits", "means")}, rng.random(REGIONS)
-
-    def weighted(columns):
-        votes = region_votes(dataclasses.replace(scene, **columns), pair, some, REGIONS, top=REGIONS)
-        return (votes.weights * jnp.asarray(weight)[votes.regions]).sum() + votes.labelled.sum()
-
-    def exact(name, change):
-        moved = dataclasses.replace(scene, **{name: columns[name].astype(np.float64) + change})
-        weights = weights_reference(moved, pair[0]).sum(-1)
-        return (weights * np.append(1 + weight, [0, 0])[some[0]]).sum()
-
-    for name, gradient in jax.jit(jax.grad(weighted))(columns).items():
-        along = rng.normal(size=gradient.shape)
-        slope = (exact(name, 1e-7 * along) - exact(name, -1e-7 * along)) / 2e-7  # no alpha meets the cut
-        assert float((gradient * along).sum()) == pytest.approx(slope, rel=0.01), name
-
-
 def test_no_order_of_views_changes_a_bit(cast, scene, cameras, labels):
     """Nor do parts that are added up apart: each is exact."""
     views = [view_evidence(scene, cameras[t], labels[t], REGIONS) for t in range(4)]

@@ -37,7 +37,7 @@ from jsecon.process import cores
 from jsecon.programs import stored_jit
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.fusion import compute_once
-from jsecon.splat.plan import ViewPlan, plan_view, render_plan
+from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.scan import CHUNK, blend_weights, make_batches, make_table, scan_tiles, to_tiles
 from jsecon.splat.visible import geometry_of_rows, visible_rows
 from jsecon.types import Array, Camera, Gaussians, Progress, Votes
@@ -124,7 +124,7 @@ def region_votes(
 
     Host code: the views are spread over the cores, and over processes that all make the same call
     (`jax.distributed`), to the same bits on any number of them. Inside a trace it is a pure function that scans the
-    views on one device, with arrays that are dense in the regions: for small scenes. There it has reverse derivatives.
+    views on one device, with arrays that are dense in the regions: for small scenes.
 
     Args:
       gaussians: Scene of N Gaussians; its columns may be memory-mapped.
@@ -377,12 +377,19 @@ def _scan_votes(
 
     def one_view(state, view):
         camera, image = view
-        image = _named(image.astype(jnp.int32), num_regions)
-        scene = gaussians, camera, jnp.asarray(near, dtype)
-        own, peaks, missing = _dense_view(scene, image, num_regions + 1, centre_pixel_weight, capacity)
-        seen = own.sum(1)
+        plan = plan_view(gaussians, camera, capacity=capacity, near=near)
+
+        def emit(state, chunk, slots, sums, largest):
+            own, peak = state
+            target = jnp.where(slots >= 0, slots, num_regions + 1)[:, None]  # an empty slot's are dropped
+            own = own.at[chunk.ids[:, :, None], target].add(sums, mode="drop")
+            return own, peak.at[chunk.ids].max(largest)
+
         weights, total, peak, views, overflow = state
-        state = weights + own, total + seen, jnp.maximum(peak, peaks), views + (seen > 0), overflow + missing
+        names = _tile_labels(plan, _named(image.astype(jnp.int32), num_regions))[:2]
+        own, peak = _scan_regions(plan, names, centre_pixel_weight, (jnp.zeros_like(weights), peak), emit)
+        seen = own.sum(1)
+        state = weights + own, total + seen, peak, views + (seen > 0), overflow + plan.overflow
         return state, seen if by_view else None
 
     nothing = jnp.zeros(count, dtype)
@@ -395,55 +402,6 @@ def _scan_votes(
     largest, ids = lax.top_k(weights, top)
     ids = jnp.where(largest > 0, ids, -1)
     return Votes(ids, largest, weights.sum(1), total, peak, views, overflow, num_regions, each)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
-def _dense_view(
-    scene: tuple[Gaussians, Camera, Array],
-    labels: Array,
-    columns: int,
-    centre_pixel_weight: float,
-    capacity: int | None,
-) -> tuple[Array, Array, Array]:
-    """Sums one view's weights on labels 0 .. `columns` - 1, (N, columns); with each one's largest, and the overflow.
-
-    Pixels of label -1 do not count.
-    """
-    gaussians, camera, near = scene
-    plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-
-    def emit(state, chunk, slots, sums, largest):
-        weights, peaks = state
-        target = jnp.where(slots >= 0, slots, columns)[:, None]  # an empty slot's are dropped
-        weights = weights.at[chunk.ids[:, :, None], target].add(sums, mode="drop")
-        return weights, peaks.at[chunk.ids].max(largest)
-
-    dtype = gaussians.means.dtype
-    start = jnp.zeros((gaussians.count, columns), dtype), jnp.zeros(gaussians.count, dtype)
-    return *_scan_regions(plan, _tile_labels(plan, labels)[:2], centre_pixel_weight, start, emit), plan.overflow
-
-
-def _dense_view_forward(scene, labels, columns, centre_pixel_weight, capacity):
-    return _dense_view(scene, labels, columns, centre_pixel_weight, capacity), (scene, labels)
-
-
-def _dense_view_backward(columns, centre_pixel_weight, capacity, kept, cotangents):
-    """The scan has no derivative. But <C, W^T onehot> is the sum of the pixels' own channels of an image of C."""
-    del columns
-    scene, labels = kept
-    remedy = "Cast them with a weight of 0."
-    require(not centre_pixel_weight, "region_votes", "a centre_pixel_weight", "votes with a derivative", remedy)
-
-    def along_cotangent(scene):
-        gaussians, camera, near = scene
-        plan = plan_view(gaussians, camera, capacity=capacity, near=near)
-        image = render_plan(plan, cotangents[0]).features
-        return jnp.where(labels >= 0, jnp.take_along_axis(image, labels[..., None], axis=-1)[..., 0], 0.0).sum()
-
-    return jax.grad(along_cotangent)(scene), None
-
-
-_dense_view.defvjp(_dense_view_forward, _dense_view_backward)
 
 
 def sum_evidence(

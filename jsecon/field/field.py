@@ -19,8 +19,7 @@ import numpy as np
 from jsecon.backend import start_backend
 from jsecon.errors import InputError, require
 from jsecon.field.columns import ROWS
-from jsecon.files import atomic_write, pack_tree, parse_json, read_arrays, reading, unpack_tree, write_arrays
-from jsecon.read.captures.images import MAX_PIXELS
+from jsecon.files import atomic_write, pack_tree, read_arrays, reading, unpack_tree, write_arrays
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import COEFFICIENT_COUNTS
 from jsecon.types import Autoencoder, Camera, Codes, Event, Gaussians, LanguageField, Regions, UpAxis, Votes
@@ -209,22 +208,9 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
         return "a tree without the smallest nodes of its Gaussians, or these without a tree"
     if field.tree is not None and not _is_tree(np.asarray(field.tree), field.regions.count):
         return "a tree whose nodes do not come before their parents, or form circles"
-    texts = (*field.names, field.embedder, field.provenance)
-    if not all(isinstance(text, str) for text in texts) or not isinstance(parse_json(field.provenance), dict):
-        return "names, embedder or provenance that are no texts, or no JSON object"
-    if field.up is not None and not _is_up_axis(field.up):
-        return "an up axis that is no unit vector with its evidence"
     scale = field.metres_per_unit
     if scale is not None and not (isinstance(scale, int | float) and 0 < scale < np.inf):
         return f"a unit of {scale!r} metres"
-    if not 0 < field.cameras.width * field.cameras.height <= MAX_PIXELS:
-        return f"views of {field.cameras.width}x{field.cameras.height} px"
-    if not all(_is_event(event, field) for event in field.history):
-        return "a history that does not fit its Gaussians and regions"
-    codes, dim = field.codes, field.regions.embeddings.shape[1]
-    coder, latent = (None, 0) if codes is None else (codes.autoencoder, codes.regions.shape[1])
-    if isinstance(coder, Autoencoder) and not _layers_fit(coder, dim, latent):
-        return "an autoencoder whose layers do not lead from embeddings to codes and back"
     return None
 
 
@@ -240,44 +226,3 @@ def _is_tree(parent: np.ndarray, count: int) -> bool:
     for _ in range(len(parent).bit_length()):  # no node is above itself
         parent = np.where(parent >= 0, parent[parent], -1)
     return bool((parent == -1).all())
-
-
-def _is_event(event: Any, field: LanguageField) -> bool:
-    """Whether an event of a file belongs to the history of a field."""
-    if not isinstance(event, Event) or not isinstance(event.gaussians, Gaussians):
-        return False
-    whole = (event.rows, field.gaussians), (event.regions, field.regions)
-    if not all(ids.dtype.kind == "i" and ((ids >= 0) & (ids < owner.count)).all() for ids, owner in whole):
-        return False
-    columns = zip(jax.tree.leaves(event.gaussians), jax.tree.leaves(field.gaussians), strict=True)
-    fits = all(a.shape == (len(event.rows), *b.shape[1:]) and np.isfinite(a).all() for a, b in columns)
-    fits &= event.views.shape == event.rows.shape
-    fits &= event.embeddings.shape == (len(event.regions), field.regions.embeddings.shape[1])
-    described = parse_json(event.description)
-    return fits and isinstance(described, dict) and all(isinstance(described.get(k), str) for k in ("kind", "date"))
-
-
-def _is_up_axis(up: Any) -> bool:
-    """Whether an up axis of a file is one."""
-    if not (isinstance(up, UpAxis) and isinstance(up.evidence, str) and isinstance(up.sure, bool)):
-        return False
-    numbers = isinstance(up.axis, tuple) and all(isinstance(number, float) for number in up.axis)
-    return numbers and len(up.axis) == 3 and bool(abs(np.linalg.norm(up.axis) - 1) < 1e-3)
-
-
-def _layers_fit(autoencoder: Autoencoder, dim: int, latent: int) -> bool:
-    """Whether the layers lead from `dim` numbers to `latent` ones and back."""
-    ways = ("encoder", autoencoder.encoder, dim, latent), ("decoder", autoencoder.decoder, latent, dim)
-    for name, variables, inputs, outputs in ways:
-        params = variables.get("params", {})
-        count = sum(layer.startswith("Dense_") for layer in params)
-        widths = [int(np.size(params.get(f"Dense_{n}", {}).get("bias", ()))) for n in range(count)]
-        sizes = zip((inputs, *widths), widths)
-        expected: dict = {"params": {f"Dense_{n}": {"kernel": size, "bias": size[1:]} for n, size in enumerate(sizes)}}
-        norms = {f"BatchNorm_{n}": (width,) for n, width in enumerate(widths[:-1]) if name == "encoder"}
-        expected["params"] |= {norm: {"scale": size, "bias": size} for norm, size in norms.items()}
-        if norms:
-            expected["batch_stats"] = {norm: {"mean": size, "var": size} for norm, size in norms.items()}
-        if jax.tree.map(np.shape, variables) != expected or widths[-1:] != [outputs]:
-            return False
-    return True

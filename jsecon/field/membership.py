@@ -199,13 +199,13 @@ def vote_columns(votes: Votes) -> Iterator[tuple[Int[Array, " n"], Float[Array, 
     """
     least, visible = _least_seen(votes), votes.weight_where_region_visible
     for k in range(votes.regions.shape[1]):
-        seen = votes.total if visible is None else jnp.maximum(visible[:, k], least)
+        seen = votes.total if visible is None else array_module(visible).maximum(visible[:, k], least)
         yield votes.regions[:, k], votes.weights[:, k], seen
 
 
 def _least_seen(votes: Votes) -> Array:
     """(N,) the least weight that any share of a Gaussian is measured against."""
-    return jnp.maximum(LABELLED_PART * votes.labelled, SEEN_PART * votes.total)
+    return array_module(votes.total).maximum(LABELLED_PART * votes.labelled, SEEN_PART * votes.total)
 
 
 def ratio(weight: Array, seen: Array) -> Array:
@@ -224,28 +224,25 @@ def inside_fraction(votes: Votes, chosen: Bool[Array, " r"]) -> _InsideFraction:
     them, where one is shown wherever the others are, and no more elsewhere. It is not known for Gaussians that no view
     sees, that have no vote for a chosen region, or whose votes are not finite.
     """
-    inside, weight = _lookup(chosen), jnp.zeros(votes.total.shape, votes.weights.dtype)
-    seen = jnp.zeros_like(weight)
+    return _add_columns(votes, _lookup(chosen))
+
+
+def _add_columns(votes: Votes, inside: Callable[[Array], Array]) -> _InsideFraction:
+    """Computes `inside_fraction` of the regions that are `inside`."""
+    xp = array_module(votes.weights)
+    weight, seen = xp.zeros((2, *votes.total.shape), votes.weights.dtype)
     for region, region_weight, region_seen in vote_columns(votes):
         here = inside(region)
-        weight += jnp.where(here, region_weight, 0.0)
-        seen = jnp.maximum(seen, jnp.where(here, region_seen, 0.0))
-    known = (votes.views > 0) & (seen > 0) & jnp.isfinite(seen) & jnp.isfinite(weight)
+        weight += xp.where(here, region_weight, 0.0)
+        seen = xp.maximum(seen, xp.where(here, region_seen, 0.0))
+    known = (votes.views > 0) & (seen > 0) & xp.isfinite(seen) & xp.isfinite(weight)
     # Written out, not by `ratio`: XLA then keeps the two sums instead of gathering them anew for each use.
-    return _InsideFraction(jnp.where(known, jnp.clip(weight / jnp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
+    return _InsideFraction(xp.where(known, xp.clip(weight / xp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
 
 
 def inside_fraction_of_regions(votes: Votes, regions: Sequence[int] | np.ndarray) -> _InsideFraction:
     """Computes the same bits as `inside_fraction` with NumPy, for a few regions: it compiles no program. Host code."""
-    inside = np.isin(votes.regions, regions)
-    weights, total = np.asarray(votes.weights), np.asarray(votes.total)
-    least = np.maximum(np.float32(LABELLED_PART) * np.asarray(votes.labelled), np.float32(SEEN_PART) * total)
-    visible = votes.weight_where_region_visible
-    seen = total[:, None] if visible is None else np.maximum(visible, least[:, None])
-    seen = np.where(inside, seen, 0).max(1)
-    weight = functools.reduce(np.add, np.where(inside, weights, 0).T)  # in the order of `inside_fraction`
-    known = (np.asarray(votes.views) > 0) & (seen > 0) & np.isfinite(seen) & np.isfinite(weight)
-    return _InsideFraction(np.where(known, np.clip(weight / np.where(known, seen, 1), 0, 1), 0), known)
+    return _add_columns(jax.tree.map(np.asarray, votes), lambda region: np.isin(region, regions))
 
 
 def inside_fraction_of_mapped(votes: Votes, regions: Sequence[int] | np.ndarray) -> _InsideFraction:
