@@ -113,7 +113,6 @@ def main() -> None:
     start = time.perf_counter()
     if asked.way == "tracking":
         labels = masklets(frames, lambda frame, t: proposals(t), tracker)
-        labels = tracker.consistent(frames, labels)
     else:
         labels = track_masks(frames, tracker.views).labels
     rest = time.perf_counter() - start

@@ -40,9 +40,9 @@ from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.field.ledger_file import save_with_ledger
 from jsecon.field.regions import region_embeddings
 from jsecon.fit.start import points_from_depth
-from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import gaussians_from_points
+from jsecon.splat.visible import HIDDEN_LOGIT
 from jsecon.types import Camera, Capture, LanguageField
 from jsecon.vision.colours import ColourEmbedder
 

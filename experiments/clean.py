@@ -25,8 +25,9 @@ from experiments import results
 from experiments.demo_rooms import fields_of_room
 from jsecon.fit.quality import measure_quality
 from jsecon.read.captures.frames import evenly_spaced
+from jsecon.splat.visible import hide
 from jsecon.types import Camera, Capture, Gaussians
-from jsecon.views.clean import find_litter, without
+from jsecon.views.clean import find_litter
 
 SHARE = 0.1
 """added Gaussians per Gaussian of the fit"""
@@ -76,7 +77,7 @@ def measure(gaussians: Gaussians, capture: Capture, seed: int) -> dict[str, floa
     cameras = jax.tree.map(np.asarray, capture.cameras[train[evenly_spaced(len(train), VIEWS)]])
     spoiled, added = spoil(gaussians, cameras, seed)
     gone, own = find_litter(spoiled, cameras) > 0, find_litter(gaussians, cameras) > 0
-    scenes = (gaussians, spoiled, without(spoiled, gone), without(gaussians, own))
+    scenes = (gaussians, spoiled, hide(spoiled, gone), hide(gaussians, own))
     quality = [float(np.mean(measure_quality(scene, capture).psnr)) for scene in scenes]
     figures = {"gone": gone[added].mean(), "lost": gone[~added].mean(), "own": own.mean()}
     figures = {name: float(value) for name, value in figures.items()}

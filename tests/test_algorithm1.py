@@ -123,14 +123,15 @@ def test_labels_of_any_integer_type_are_taken(kind):
 def test_clean_tracks(seed):
     rng = np.random.default_rng(seed)
     labels = rng.choice([-1, -1, 0, 1, 2, 5], (4, 6, 6), p=[0.2, 0.2, 0.3, 0.2, 0.08, 0.02]).astype(np.int16)
-    clean = clean_tracks(labels, min_area=0.06, min_views=2)
-    np.testing.assert_array_equal(clean_tracks(clean, min_area=0.06, min_views=2), clean)
+    clean, number = clean_tracks(labels, 6)
+    np.testing.assert_array_equal(clean_tracks(clean, 6)[0], clean)
+    np.testing.assert_array_equal(np.append(number, -1)[labels][clean >= 0], clean[clean >= 0])
     ids = np.unique(clean[clean >= 0])
     np.testing.assert_array_equal(ids, np.arange(len(ids)))  # numbered without gaps, in order of appearance
     assert list(np.argsort([np.flatnonzero((clean == i).any((1, 2)))[0] for i in ids], kind="stable")) == list(ids)
     for old in (0, 1, 2, 5):
         areas = (labels == old).sum((1, 2))
-        enough = areas >= 0.06 * 36
+        enough = areas >= 1
         new = clean[labels == old]
         assert (new >= 0).sum() == (areas[enough].sum() if enough.sum() >= 2 else 0)
         assert len(np.unique(new[new >= 0])) <= 1

@@ -32,8 +32,8 @@ def group(*args, **options):
     return _group_by_consensus(*args, **options).owner
 
 
-def scene_of(world, proposals, atoms=60):
-    return SceneSuperpixels(world[0], world[1], proposals, superpixels_per_frame=atoms)
+def scene_of(world, proposals):
+    return SceneSuperpixels(world[0], world[1], proposals)
 
 
 def regions_of(tree, count, node):
@@ -74,7 +74,7 @@ def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
     for t in (5, 12):
         worse[t] = np.concatenate([proposals[t] & left, proposals[t] & ~left])
     worse[20] = np.zeros((0, HEIGHT, WIDTH), bool)
-    labels = as_truth(track_masks(frames, scene_of(world, worse, atoms=300)).labels, truth)
+    labels = as_truth(track_masks(frames, scene_of(world, worse)).labels, truth)
     scores = ious(labels - 1, truth, 3)
     assert np.nanmean(scores) > 0.85
     assert np.nanmean(scores[[2, 9, 16, 20]]) > 0.6  # and there, too, the Gaussians tell the balls apart
@@ -98,7 +98,7 @@ def test_what_some_views_cut_has_a_common_node(world):
         rows = np.flatnonzero((truth[t] == 1).any(1))
         upper = np.arange(HEIGHT)[:, None] < rows.mean() if len(rows) else np.ones((HEIGHT, 1), bool)
         cut[t] = np.concatenate([proposals[t] & upper, proposals[t] & ~upper])
-    scene = scene_of(world, cut, atoms=300)
+    scene = scene_of(world, cut)
     found = track_masks(frames, scene, agreement=0.8)
     count = int(found.labels.max()) + 1
     inside = [np.bincount(truth[found.labels == r] + 1, minlength=5)[1:].argmax() for r in range(count)]
@@ -129,7 +129,7 @@ def test_parts_that_masks_show_alone_are_labelled(world):
             upper = np.arange(HEIGHT)[:, None] < rows.mean()
             halves = np.stack([(truth[t] == 1) & upper, (truth[t] == 1) & ~upper])
             layered[t] = np.concatenate([proposals[t], halves])
-    found = track_masks(frames, scene_of(world, layered, atoms=300))
+    found = track_masks(frames, scene_of(world, layered))
     count, ball = int(found.labels.max()) + 1, int(np.bincount(found.labels[truth == 1] + 1).argmax()) - 1
     assert found.parts.shape[1:] == found.labels.shape
     own = []

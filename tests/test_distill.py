@@ -108,10 +108,10 @@ def dense_weights(scene, cameras):
 
 def test_steps_equal_the_definition_in_float64(task):
     """Loss and four Adam steps, PyTorch's formula, from a dense matrix of weights; each step takes another view."""
-    scene, cameras, labels, codes, _, capacity = task
+    scene, cameras, labels, codes, _, _ = task
     weights, flat = dense_weights(scene, cameras), np.asarray(labels).reshape(4, -1)
     start = 0.1 * unit_rows(np.random.default_rng(2), scene.count, 3)
-    got, history = distill_l1(scene, cameras, labels, codes, steps=4, key=KEY, init=start, capacity=capacity)
+    got, history = distill_l1(scene, cameras, labels, codes, steps=4, key=KEY, init=start)
     truth, taken = np.asarray(codes, np.float64), []
     features, first, second = start.astype(np.float64), 0.0, 0.0
     for step, loss in enumerate(np.asarray(history), start=1):
@@ -149,9 +149,9 @@ def test_the_gradient_of_the_rendered_l1_is_that_of_finite_differences(task, sca
 
 
 def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denominator_alone(task):
-    scene, cameras, labels, codes, _, capacity = task
+    scene, cameras, labels, codes, _, _ = task
     behind = dataclasses.replace(scene, means=scene.means.at[0].set(jnp.asarray([0.0, 50.0, 0.0])))
-    options = {"steps": 3, "key": KEY, "capacity": capacity}
+    options = {"steps": 3, "key": KEY}
     got, _ = distill_l1(behind, cameras, labels, codes, init="random", **options)
     assert (np.asarray(got[0]) == 0).all()
     _, history = distill_l1(scene, cameras, jnp.full_like(labels, -1), codes, init="random", **options)

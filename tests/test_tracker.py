@@ -15,7 +15,7 @@ def world():
 @pytest.fixture(scope="module")
 def tracker(world):
     gaussians, cameras, _, _, proposals = world
-    return GeometricTracker(gaussians, cameras, proposals, superpixels_per_frame=60)
+    return GeometricTracker(gaussians, cameras, proposals)
 
 
 def prompts_at(truth, t):
@@ -40,30 +40,16 @@ def test_where_a_frame_proposes_nothing_or_a_merger_the_gaussians_find_the_ball(
     worse = list(proposals)
     worse[13] = np.zeros((0, HEIGHT, WIDTH), bool)
     worse[14] = (truth[14] >= 0)[None]  # everything is one region
-    tracker = GeometricTracker(gaussians, cameras, lambda t: worse[t], superpixels_per_frame=300)
+    tracker = GeometricTracker(gaussians, cameras, lambda t: worse[t])
     scores = ious(tracker(frames, 12, prompts_at(truth, 12)), truth, 3)
     assert np.nanmin(scores[[13, 14]]) > 0.5
     assert np.nanmean(np.delete(scores, [13, 14], axis=0)) > 0.9  # and the track goes on behind them
 
 
-def test_consistent_gives_a_rare_part_to_its_owner_and_keeps_the_rest(world, tracker):
-    _, _, frames, truth, _ = world
-    labels = truth.copy()
-    labels[3][(truth[3] == 1) & (np.arange(WIDTH) < WIDTH // 2)] = 4  # half a ball, in one frame only
-    settled = tracker.consistent(frames, labels)
-    np.testing.assert_array_equal(settled, truth)
-    np.testing.assert_array_equal(tracker.consistent(frames, truth), truth)
-    np.testing.assert_array_equal(tracker.consistent(frames, labels.astype(np.uint8)), settled)
-    nothing = np.full_like(truth, -1)
-    np.testing.assert_array_equal(tracker.consistent(frames, nothing), nothing)
-
-
 def test_bad_arguments_are_refused(world, tracker):
-    gaussians, cameras, frames, truth, proposals = world
+    _, _, frames, truth, _ = world
     with pytest.raises(ValueError, match="prompts"):
         tracker(frames, 0, prompts_at(truth, 0)[:, 1:])
-    with pytest.raises(ValueError, match="superpixels_per_frame"):
-        GeometricTracker(gaussians, cameras, proposals, superpixels_per_frame=0)
 
 
 @pytest.mark.parametrize("count", [1, 20, 200])

@@ -20,9 +20,10 @@ from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.fit.resize import scale_cameras
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA
 from jsecon.process import cores
-from jsecon.query.render import ALPHA_THRESHOLD, HIDDEN_LOGIT, VALA_THRESHOLD
+from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.scan import pixel_centres, to_tiles
+from jsecon.splat.visible import HIDDEN_LOGIT
 from jsecon.types import Array, Camera, Gaussians
 
 SILHOUETTE_WEIGHTS = {"silhouette": (2.0, 1.0), "strict_silhouette": (1.0, 0.0), "lenient_silhouette": (0.0, 1.0)}

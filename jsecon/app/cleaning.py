@@ -18,8 +18,9 @@ from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_s
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.splats.files import require_writable_format, save_gaussians
+from jsecon.splat.visible import hide
 from jsecon.types import Camera, Capture, Gaussians, Progress
-from jsecon.views.clean import KINDS, find_litter, without
+from jsecon.views.clean import KINDS, find_litter
 
 
 def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
@@ -43,7 +44,7 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
     words = ", ".join(f"{count} {kind} ({count / len(kinds):.1%})" for kind, count in list(counts.items())[1:])
     console.print_line(f"gone    {words}")
     with console.progress("quality") as progress:
-        quality, line = _quality(scene, without(scene, kinds > 0), cameras, capture, progress)
+        quality, line = _quality(scene, hide(scene, kinds > 0), cameras, capture, progress)
     console.print_line(line)
     with console.progress("files"):
         del scene  # read again, a large one fits into memory once

@@ -36,6 +36,8 @@ PART_AGREEMENT = 0.9
 """Probability of a common mask from which pieces are one part of an object."""
 MOST_PIECES, PIECE_SIZE = 300, 16
 """Most pieces of one object, and mean number of Gaussians of each: those of fewer have no plane to tell a wall by."""
+MIN_AREA = 0.001
+"""Share of a frame below which it shows no object."""
 NEW_NODE = 0.1
 """Share of its weight that a join must add to make a node of its own."""
 LEAST_PART, MOST_PART = 0.01, 0.85
@@ -361,7 +363,7 @@ def track_masks(
         if count:
             mass = (view.votes.T @ one_hot(owner[view.seen], count)).toarray()
             image[:] = assign_superpixels(view, mass, mass.sum(1, keepdims=True))[view.labels]
-    cleaned, number = _clean(labels, count)
+    cleaned, number = clean_tracks(labels, count)
     tree, leaf = _with_parts(_object_tree(groups, number), groups, number)
     return Objects(cleaned, tree, leaf, *_visible_parts(views, cleaned, tree, leaf, signatures[2]))
 
@@ -499,28 +501,18 @@ def _nodes_under(tree: Int32[np.ndarray, " m"]) -> Sparse:
 
 
 def clean_tracks(
-    labels: Integer[np.ndarray, "t h w"], *, min_area: float = 0.001, min_views: int = 2
-) -> Int16[np.ndarray, "t h w"]:
-    """Removes objects that few frames show, and renumbers the others in order of first appearance.
-
-    Args:
-      labels: (T, H, W) labels, -1 for no object.
-      min_area: Share of a frame below which an object is removed from it.
-      min_views: Least number of frames that show an object.
-    """
-    labels = np.asarray(labels).astype(np.int32)
-    return _clean(labels, int(labels.max(initial=-1)) + 1, min_area, min_views)[0]
-
-
-def _clean(
-    labels: Integer[np.ndarray, "t h w"], count: int, min_area: float = 0.001, min_views: int = 2
+    labels: Integer[np.ndarray, "t h w"], count: int
 ) -> tuple[Int16[np.ndarray, "t h w"], Int[np.ndarray, " r"]]:
-    """Cleans the labels of `count` objects as `clean_tracks` does; also the new number of each, -1 if it is removed."""
+    """Removes objects that fewer than two frames show, and renumbers the others in order of first appearance.
+
+    In a frame of which it fills less than MIN_AREA an object is removed too. `labels` are below `count`, -1 for no
+    object. Also returns the new number of each object, -1 if it is removed.
+    """
     if count == 0:
         return np.full(labels.shape, -1, np.int16), np.zeros(0, int)
     areas = np.stack([np.bincount(image[image >= 0].reshape(-1), minlength=count) for image in labels])  # (T, R)
-    shown = areas >= max(min_area * labels[0].size, 1)
-    kept = shown.sum(0) >= min_views
+    shown = areas >= max(MIN_AREA * labels[0].size, 1)
+    kept = shown.sum(0) >= 2
     first = np.where(kept, shown.argmax(0), len(labels))
     order = np.lexsort((np.arange(count), first))[: kept.sum()]
     number = np.full(count + 1, -1, np.int16)  # the last entry is for label -1

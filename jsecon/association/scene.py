@@ -25,6 +25,8 @@ from jsecon.vision.surfaces import fill_nearest
 
 Sparse: TypeAlias = Any
 """scipy.sparse.csr_matrix, which type checkers cannot resolve."""
+SUPERPIXELS_PER_FRAME = 256
+"""Approximate number before the cut along proposals."""
 MIN_SUPERPIXEL_PX = 12
 """Least size in px; smaller pieces are slivers along an edge."""
 
@@ -58,7 +60,6 @@ class SceneSuperpixels:
       cameras: Batch of T cameras, one per frame.
       proposals: Masks (M, H, W) bool of each frame, which may overlap: a sequence, or a function of the index of a
         frame, which is called in several threads.
-      superpixels_per_frame: Approximate number of superpixels per frame before the cut along proposals.
       centre_pixel_weight: As for `region_votes`; above 0 if answers are judged at the centres of Gaussians.
     """
 
@@ -68,13 +69,10 @@ class SceneSuperpixels:
         cameras: Camera,
         proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
         *,
-        superpixels_per_frame: int = 256,
         centre_pixel_weight: float = 0.0,
     ):
-        remedy = "Use 200 for small frames."
-        require(superpixels_per_frame > 0, "superpixels_per_frame", superpixels_per_frame, "at least 1", remedy)
         self.gaussians, self.cameras, self.count = gaussians, cameras, gaussians.count
-        self.superpixels_per_frame, self.centre_pixel_weight = superpixels_per_frame, centre_pixel_weight
+        self.centre_pixel_weight = centre_pixel_weight
         self.propose = proposals if callable(proposals) else proposals.__getitem__
         self._views: list[FrameSuperpixels] = []
         self.shared = np.zeros((0, 0), np.float32)
@@ -86,7 +84,7 @@ class SceneSuperpixels:
         """Superpixels, visible Gaussians, arrays and shape of their weights, and proposals of a frame."""
         masks = np.asarray(self.propose(t), bool)
         cast = plan_evidence(self.gaussians, self.cameras[t], centre_pixel_weight=self.centre_pixel_weight)
-        view = frame_superpixels(frame, masks, cast, count=self.superpixels_per_frame)
+        view = frame_superpixels(frame, masks, cast)
         votes = view.votes
         return view.labels, view.seen, [votes.data, votes.indices, votes.indptr], votes.shape, view.proposals
 
@@ -111,9 +109,9 @@ class SceneSuperpixels:
                 depths = np.asarray(self.gaussians.means)[view.seen] @ pose[2, :3] + pose[2, 3]
                 cross_sections[t, view.seen] = view.totals * depths**2 / float(camera.fx * camera.fy)
                 all_depths.append(depths)
-            self.median_depth = _weighted_median(
-                np.concatenate(all_depths), np.concatenate([view.totals for view in views])
-            )
+            depths, weights = np.concatenate(all_depths), np.concatenate([view.totals for view in views])
+            if len(depths):
+                self.median_depth = float(np.quantile(depths, 0.5, weights=weights, method="inverted_cdf"))
             highest = np.maximum(cross_sections.max(0), 1e-30)
             self._views = [
                 dataclasses.replace(view, clarity=area[view.seen] / highest[view.seen])
@@ -125,10 +123,10 @@ class SceneSuperpixels:
 
 
 def frame_superpixels(
-    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], cast: CastLabels, *, count: int = 256
+    frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m h w"], cast: CastLabels
 ) -> FrameSuperpixels:
-    """Cuts a frame into about `count` superpixels, with the weights of the Gaussians on them, but for the faintest."""
-    labels = superpixels(frame, masks, count=count)
+    """Cuts a frame into superpixels, with the weights of the Gaussians on them, but for the faintest."""
+    labels = superpixels(frame, masks, count=SUPERPIXELS_PER_FRAME)
     number = int(labels.max()) + 1
     evidence = cast(labels, number)
     columns = evidence.weights.copy(), evidence.regions, evidence.starts
@@ -139,13 +137,6 @@ def frame_superpixels(
     seen = np.flatnonzero(np.diff(votes.indptr))
     within = superpixel_coverage(labels, masks, number)
     return FrameSuperpixels(labels, evidence.gaussians[seen], votes[seen], within, np.ones(len(seen), np.float32))
-
-
-def _weighted_median(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> float:
-    """Returns the least value with at least half of the weight at or below it; 0 if there are none."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order], dtype=np.float64)
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]]) if len(values) else 0.0
 
 
 def assign_superpixels(

@@ -21,11 +21,10 @@ from scipy.spatial.transform import Rotation
 from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.numerics import axes_across
-from jsecon.query.render import hide
 from jsecon.splat.points import back_project
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.sh import C0
-from jsecon.splat.visible import points_in_view
+from jsecon.splat.visible import hide, points_in_view
 from jsecon.types import Camera, Gaussians
 
 KINDS = ("same", "moved", "gone", "new", "look", "unsure", "not seen")

@@ -18,8 +18,8 @@ from jsecon.errors import InputError
 from jsecon.field.ledger import Ledger, LedgerView, add_views
 from jsecon.files import parse_json
 from jsecon.fit.growth import pad_rows
-from jsecon.query.render import HIDDEN_LOGIT
 from jsecon.splat.transform import transform_gaussians
+from jsecon.splat.visible import HIDDEN_LOGIT
 from jsecon.types import Event, Gaussians, LanguageField
 
 _QUESTIONS = {"what moved": "moved", "what is gone": "gone", "what is new": "new", "what changed": ""}

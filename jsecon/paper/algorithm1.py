@@ -4,62 +4,33 @@ A masklet S_r is the masks of one object in all frames. The paper leaves the ove
 decided here stands in `masklets`.
 """
 
-import dataclasses
-
 import numpy as np
-from jaxtyping import Bool, Int16
+from jaxtyping import Int16
 from scipy import sparse
 
-from jsecon.association.consensus import clean_tracks
+from jsecon.association.consensus import MIN_AREA, clean_tracks
 from jsecon.association.scene import Sparse, one_hot
 from jsecon.errors import require, require_shape
 from jsecon.types import Progress
 from jsecon.vision.protocols import Segmenter, Tracker
 
 
-@dataclasses.dataclass(frozen=True)
-class _RunLengthMasks:
-    """R masks over P pixels, which may overlap: some hundred numbers per mask instead of an image."""
-
-    starts: np.ndarray
-    """(K,) int32 first pixel of each run, ascending within a mask."""
-    stops: np.ndarray
-    """(K,) int32 pixel after the last of each run."""
-    counts: np.ndarray
-    """(R,) int32 number of runs of each mask."""
-    pixels: int
-    """P, pixels of an image."""
-
-    def rows(self) -> Sparse:
-        """Decodes the masks as a sparse matrix (R, P) of float32 ones."""
-        lengths = (self.stops - self.starts).astype(np.int64)
-        ends = np.concatenate([[0], np.cumsum(lengths)])
-        columns = np.arange(ends[-1]) + np.repeat(self.starts - ends[:-1], lengths)
-        ends = ends[np.concatenate([[0], np.cumsum(self.counts)])]
-        shape = (len(self.counts), self.pixels)
-        return sparse.csr_matrix((np.ones(len(columns), np.float32), columns.astype(np.int32), ends), shape=shape)
-
-    def concatenate(self, others: "_RunLengthMasks") -> "_RunLengthMasks":
-        """Appends masks over the same pixels."""
-        starts, stops = (np.concatenate(pair) for pair in zip((self.starts, self.stops), (others.starts, others.stops)))
-        return _RunLengthMasks(starts, stops, np.concatenate([self.counts, others.counts]), self.pixels)
+def _encode(rows: Sparse) -> Sparse:
+    """Encodes the runs of ones in rows (R, P): (R, P + 1) with 1 where a run begins, and -1 behind its end."""
+    pixels = rows.shape[1]
+    runs = (rows @ sparse.diags([1.0, -1.0], offsets=[0, 1], shape=(pixels, pixels + 1), dtype=np.float32)).tocsr()
+    runs.eliminate_zeros()
+    runs.sort_indices()
+    return runs
 
 
-def _encode_rows(rows: Sparse) -> _RunLengthMasks:
-    """Encodes masks that are the nonzeros of the rows of a csr_matrix (R, P) with sorted indices."""
-    new = np.ones(rows.nnz, bool)
-    new[1:] = np.diff(rows.indices) != 1
-    new[rows.indptr[:-1][np.diff(rows.indptr) > 0]] = True
-    first = np.flatnonzero(new)
-    last = np.append(first[1:], rows.nnz) - 1 if len(first) else first
-    counts = np.diff(np.searchsorted(first, rows.indptr))
-    starts, stops = rows.indices[first], rows.indices[last] + 1
-    return _RunLengthMasks(starts.astype(np.int32), stops.astype(np.int32), counts.astype(np.int32), rows.shape[1])
-
-
-def _encode_masks(masks: Bool[np.ndarray, "r h w"]) -> _RunLengthMasks:
-    """Encodes masks (R, H, W) over P = H W pixels."""
-    return _encode_rows(sparse.csr_matrix(masks.reshape(len(masks), masks.shape[1] * masks.shape[2])))
+def _decode(runs: Sparse) -> Sparse:
+    """Decodes what `_encode` encoded, to rows (R, P) of float32 ones."""
+    starts, stops = runs.indices[::2], runs.indices[1::2]
+    ends = np.concatenate([[0], np.cumsum(stops - starts, dtype=np.int64)])
+    columns = np.arange(ends[-1]) + np.repeat(starts - ends[:-1], stops - starts)
+    entries = np.ones(len(columns), np.float32), columns.astype(np.int32), ends[runs.indptr // 2]
+    return sparse.csr_matrix(entries, shape=(runs.shape[0], runs.shape[1] - 1))
 
 
 def masklets(
@@ -68,13 +39,12 @@ def masklets(
     track: Tracker,
     *,
     iou_threshold: float = 0.5,
-    min_area: float = 0.001,
     max_masklets: int = 1000,
     progress: Progress | None = None,
 ) -> Int16[np.ndarray, "t h w"]:
     """Makes the masklets of a sequence by Algorithm 1 of the paper.
 
-    For each frame t in order, a proposal becomes a prompt if it fills at least `min_area` of the frame and its IoU with
+    For each frame t in order, a proposal becomes a prompt if it fills at least MIN_AREA of the frame and its IoU with
     the mask of every masklet in frame t is at most `iou_threshold`; of those that repeat each other the best does. The
     prompts of a frame are tracked through the whole sequence.
 
@@ -89,7 +59,6 @@ def masklets(
       segment: Proposes masks of a frame.
       track: Follows masks through all frames.
       iou_threshold: The paper's kappa.
-      min_area: Least area of a proposal, as a share of the frame.
       max_masklets: Maximum number of tracked prompts.
       progress: Called with the number of frames done and of all.
 
@@ -106,21 +75,22 @@ def masklets(
     for t in range(count):
         masks = np.asarray(segment(frames[t], t), bool)
         require_shape("segment", masks, ("M", height, width), "A segmenter returns masks of the size of the frame.")
-        masks = masks[masks.sum((1, 2)) >= max(min_area * height * width, 1)]
-        proposals.add_masks(t, masks)
+        masks = masks[masks.sum((1, 2)) >= max(MIN_AREA * height * width, 1)]
+        proposals.add(t, sparse.csr_matrix(masks.reshape(len(masks), height * width)))
         prompts = masks[_new(proposals.at(t), layers.at(t), iou_threshold)[: max(max_masklets - layers.size(t), 0)]]
         if len(prompts):
             labels = np.asarray(track(frames, t, prompts))
             require_shape("track", labels, (count, height, width), "A tracker returns one label image per frame.")
             for other, image in enumerate(labels):
-                layers.add_labels(other, image, len(prompts))
+                known = np.where((image >= 0) & (image < len(prompts)), image, -1).astype(np.int32)
+                layers.add(other, one_hot(known.reshape(-1), len(prompts)).T)
         if progress is not None:
             progress(t + 1, count)
     if not count or not layers.size(0):
         return np.full((count, height, width), -1, np.int16)
     whole, area, support = _joined(layers, proposals)
     order = np.lexsort((np.where(support >= 0.5, area, -support), support < 0.5))
-    return clean_tracks(whole.flatten(order), min_area=min_area)
+    return clean_tracks(whole.flatten(order), whole.size(0))[0]
 
 
 def _joined(layers: "_Layers", proposals: "_Layers") -> tuple["_Layers", np.ndarray, np.ndarray]:
@@ -191,36 +161,26 @@ class _Layers:
 
     def __init__(self, count: int, height: int, width: int):
         self.count, self.shape = count, (height, width)
-        empty = np.zeros(0, np.int32)
-        self.runs = [_RunLengthMasks(empty, empty, empty, height * width) for _ in range(count)]
+        self.runs = [_encode(sparse.csr_matrix((0, height * width), dtype=np.float32))] * count
 
     def size(self, t: int) -> int:
-        return len(self.runs[t].counts)
+        return self.runs[t].shape[0]
 
     def at(self, t: int) -> Sparse:
         """(R, H W) ones at frame t."""
-        return self.runs[t].rows()
+        return _decode(self.runs[t])
 
-    def add_masks(self, t: int, masks: np.ndarray) -> None:
-        """Appends masks (M, H, W) bool to frame t."""
-        self.runs[t] = self.runs[t].concatenate(_encode_masks(masks))
-
-    def add_labels(self, t: int, labels: np.ndarray, number: int) -> None:
-        """Appends `number` masks to frame t: the pixels (H, W) labelled 0, 1, ..."""
-        pixels = np.flatnonzero((labels >= 0) & (labels < number))
-        ones = np.ones(len(pixels), np.float32)
-        rows = sparse.csr_matrix((ones, (labels.reshape(-1)[pixels], pixels)), shape=(number, labels.size))
-        self.runs[t] = self.runs[t].concatenate(_encode_rows(rows))
+    def add(self, t: int, rows: Sparse) -> None:
+        """Appends masks to frame t, the ones of rows (M, H W)."""
+        self.runs[t] = sparse.vstack([self.runs[t], _encode(rows)], "csr")
 
     def grouped(self, groups: np.ndarray) -> "_Layers":
         """Unites the masks of each group (R,), in the order of the groups."""
         names, number = np.unique(groups, return_inverse=True)
-        unite = one_hot(number, len(names)).T.tocsr()
+        unite = one_hot(number, len(names)).T
         result = _Layers(self.count, *self.shape)
         for t in range(self.count):
-            united = unite @ self.at(t)
-            united.sort_indices()
-            result.runs[t] = _encode_rows(united)
+            result.add(t, (unite @ self.at(t)).sign())
         return result
 
     def flatten(self, best_first: np.ndarray) -> np.ndarray:

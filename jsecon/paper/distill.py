@@ -20,7 +20,7 @@ from jsecon.errors import require, require_one_of, require_shape
 from jsecon.numerics import is_traced, normalize, require_labels, safe_norm
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.plan import ViewPlan, plan_view, prepare_views, render_plan
-from jsecon.types import Array, Camera, Gaussians, Key, Progress, Votes
+from jsecon.types import Array, Camera, Gaussians, Key, Votes
 
 _ROWS = 8192
 """Gaussians reduced at a time: (rows, K, d) is the largest array of a reduction, 134 MB at K = 8, d = 512"""
@@ -95,16 +95,6 @@ def _median(values: Array, weight: Array) -> Array:
 _REDUCTIONS = {"mean": _mean, "median": _median, "mode": _mode}
 
 
-class _State(NamedTuple):
-    """Where `distill_l1` stands."""
-
-    features: Array  # (N, d) before normalisation
-    moments: Any  # Adam's
-    order: Array  # (steps,) int32 the view of each step
-    history: Array  # (steps,) losses so far
-    step: Array  # () int32 steps taken
-
-
 class _Distillation(NamedTuple):
     """What `distill_l1` trains. A loss is NaN for a view that overflowed the capacity."""
 
@@ -123,8 +113,6 @@ def distill_l1(
     steps: int,
     key: Key,
     init: str | Float[Array, "n d"] = "zero",
-    capacity: int | None = None,
-    progress: Progress | None = None,
 ) -> _Distillation:
     """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`rendered_l1`), with rate 0.0025.
 
@@ -141,8 +129,6 @@ def distill_l1(
         Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves from the corner of
         the cube that its first step took it to. "random" (of length 0.01, which turns within tens of steps) or (N, d)
         codes, such as those of `distill_votes`, escape it.
-      capacity: Number of (block, Gaussian) pairs of a view, see `render`.
-      progress: Called as progress(done, total), in steps.
 
     Returns:
       The codes and the losses.
@@ -168,29 +154,21 @@ def distill_l1(
         features = jnp.asarray(init, dtype)
     rounds = jax.random.split(order_key, -(-steps // views))
     order = jax.vmap(lambda k: jax.random.permutation(k, views))(rounds).reshape(-1)[:steps].astype(jnp.int32)
-    state = _State(features, _optimizer().init(features), order, jnp.zeros(steps, dtype), jnp.zeros((), jnp.int32))
     # Regions in multiples of 256, the last without a code: scenes share their compiled programs.
     table = jnp.pad(jnp.asarray(region_codes), ((0, -len(region_codes) % 256), (0, 0)))
-    stretch = steps if progress is None else max(1, -(-steps // 100))
-    plans = prepare_views(gaussians, cameras, capacity=capacity)
-    if plans is None and capacity is None and not is_traced((gaussians, cameras)):
+    plans, capacity = prepare_views(gaussians, cameras), None
+    if plans is None and not is_traced((gaussians, cameras)):
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
-    for begin in range(0, steps, stretch):
-        stop = min(begin + stretch, steps)
-        state = _descend(state, gaussians, cameras, labels, table, plans, stop, capacity)
-        if progress is not None:
-            jax.block_until_ready(state.step)
-            progress(stop, steps)
-    if not is_traced(state.history):
-        problem = f"capacity={capacity}, too small for a view, or NaN"
-        expected = "every view within the capacity, finite Gaussians and codes"
-        remedy = "Leave capacity out, and check the Gaussians with jsecon.splat.project.count_non_finite."
-        require(not bool(jnp.isnan(state.history).any()), "distill_l1", problem, expected, remedy)
-    codes = normalize(state.features)
+    trained, losses = _descend(features, gaussians, cameras, labels, table, plans, order, capacity)
+    if not is_traced(losses):
+        remedy = "Check the Gaussians with jsecon.splat.project.count_non_finite."
+        finite = not bool(jnp.isnan(losses).any())
+        require(finite, "distill_l1", "a loss that is NaN", "finite Gaussians and codes", remedy)
+    codes = normalize(trained)
     if isinstance(init, str) and init == "random":
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
-        codes = jnp.where(jnp.any(state.features != features, axis=1, keepdims=True), codes, 0.0)
-    return _Distillation(codes, state.history)
+        codes = jnp.where(jnp.any(trained != features, axis=1, keepdims=True), codes, 0.0)
+    return _Distillation(codes, losses)
 
 
 def rendered_l1(
@@ -219,7 +197,8 @@ def _optimizer() -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="capacity")
-def _descend(state, gaussians, cameras, labels, region_codes, plans, until, capacity) -> _State:
+def _descend(features, gaussians, cameras, labels, region_codes, plans, order, capacity) -> tuple[Array, Array]:
+    """Takes a step for each view of an order (steps,); returns the features and the loss before each step."""
     optimizer, codes = _optimizer(), normalize(region_codes)
 
     def loss(features, view):
@@ -229,11 +208,11 @@ def _descend(state, gaussians, cameras, labels, region_codes, plans, until, capa
             plan = jax.tree.map(lambda a: a[view], plans)
         return rendered_l1(features, plan, labels[view], codes)
 
-    def step(index, state):
-        (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(state.features, state.order[index])
-        updates, moments = optimizer.update(gradient, state.moments)
-        features = state.features + updates
-        history = state.history.at[index].set(jnp.where(overflow > 0, jnp.nan, value))
-        return _State(features, moments, state.order, history, jnp.asarray(index + 1, jnp.int32))
+    def step(state, view):
+        features, moments = state
+        (value, overflow), gradient = jax.value_and_grad(loss, has_aux=True)(features, view)
+        updates, moments = optimizer.update(gradient, moments)
+        return (features + updates, moments), jnp.where(overflow > 0, jnp.nan, value)
 
-    return jax.lax.fori_loop(state.step, until, step, state)
+    (features, _), losses = jax.lax.scan(step, (features, optimizer.init(features)), order)
+    return features, losses

@@ -27,6 +27,7 @@ CODE_THRESHOLD = 0.9
 """Smallest cosine with the region's code: codes of one region lie within a few degrees (0.9 is 26)."""
 
 
+@jax.jit
 def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"], threshold: Number) -> Selection:
     """Selects the Gaussians whose code has a cosine of at least `threshold` with the text's code.
 
@@ -43,15 +44,11 @@ def query_one_step(codes: Float[Array, "n d"], text_code: Float[Array, " d_text"
       ValueError: Shapes disagree.
     """
     require_shape("query_one_step", text_code, (codes.shape[1],), "Encode the text with the field's autoencoder.")
-    return _one_step(codes, text_code, threshold)
-
-
-@jax.jit
-def _one_step(codes: Array, text_code: Array, threshold: Number) -> Selection:
     similarity, known = similarities(codes, text_code)
     return _selection(similarity, known, threshold)
 
 
+@jax.jit
 def query_canonical(
     features: Float[Array, "n d"],
     text: Float[Array, " d_text"],
@@ -76,11 +73,6 @@ def query_canonical(
     fit = text.shape[0] == size and canonical.shape[1] == size and canonical.shape[0] >= 1
     shapes, expected = f"text {text.shape}, canonical {canonical.shape}", f"({size},) and (C >= 1, {size})"
     require(fit, "query_canonical", shapes, expected, "Embed or encode text and canonical phrases as the features are.")
-    return _canonical(features, text, canonical, threshold)
-
-
-@jax.jit
-def _canonical(features: Array, text: Array, canonical: Array, threshold: Number) -> Selection:
     return _selection(*_relevancies(features, text, canonical), threshold)
 
 

@@ -6,16 +6,13 @@ The votes of the Gaussians on the superpixels of the frames lift a mask and rend
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int16, Integer, UInt8
-from scipy import sparse
+from jaxtyping import Bool, Float, Int, Int16, UInt8
 
 from jsecon.association.scene import (
     FrameSuperpixels,
     SceneSuperpixels,
-    Sparse,
     assign_superpixels,
     one_hot,
-    sum_entries,
     superpixel_coverage,
 )
 from jsecon.errors import require_shape
@@ -32,19 +29,13 @@ class GeometricTracker:
     counts as known in proportion to its clarity in the visited frames, fully from half of its clarity in the present
     frame.
 
-    `proposals` has the masks (M, H, W) of each frame; `superpixels_per_frame` is approximate, before the cut along
-    them.
+    `proposals` has the masks (M, H, W) of each frame.
     """
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        cameras: Camera,
-        proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray],
-        *,
-        superpixels_per_frame: int = 256,
+        self, gaussians: Gaussians, cameras: Camera, proposals: Callable[[int], np.ndarray] | Sequence[np.ndarray]
     ):
-        self.views = SceneSuperpixels(gaussians, cameras, proposals, superpixels_per_frame=superpixels_per_frame)
+        self.views = SceneSuperpixels(gaussians, cameras, proposals)
 
     def __call__(
         self, frames: UInt8[np.ndarray, "t h w 3"], index: int, prompts: Bool[np.ndarray, "b _ _"]
@@ -100,36 +91,6 @@ class GeometricTracker:
                 free &= ~competitor
         return np.stack([*classes, free])
 
-    def consistent(
-        self, frames: UInt8[np.ndarray, "t h w 3"], labels: Integer[np.ndarray, "t h w"]
-    ) -> Int[np.ndarray, "t h w"]:
-        """Merges regions whose Gaussians belong to another region in the sum of all views.
-
-        A region stays if at least half of its weight falls on Gaussians that it has the largest weight on. Otherwise (a
-        part that few frames separate, a shadow) its pixels go to the region that owns most of it. The labels, -1 for no
-        region, keep their numbers; some regions may have no pixels left.
-        """
-        labels = np.array(labels, np.int32)
-        count = int(labels.max(initial=-1)) + 1
-        for _ in range(4 if count else 0):  # a merger may affect other regions; rarely more than two rounds
-            entries = []
-            for t, view in enumerate(self.views.all(frames)):
-                shares = _label_shares(view.labels, labels[t], view.votes.shape[1], count)
-                cast = (view.votes @ shares).tocoo()
-                entries.append((cast.data, view.seen[cast.row], cast.col))
-            votes = sum_entries(entries, (self.views.count, count))
-            winner = np.asarray(votes.argmax(axis=1)).reshape(-1)
-            # (R, R): row r's weight by the region that owns the Gaussian
-            cast = (votes.T @ one_hot(winner, count)).toarray()
-            heir = cast.argmax(1)
-            total = np.maximum(cast.sum(1), 1e-12)
-            lost = (heir != np.arange(count)) & (np.diagonal(cast) < 0.5 * total)
-            if not lost.any():
-                break
-            table = np.append(np.where(lost, heir, np.arange(count)), -1).astype(labels.dtype)
-            labels = table[labels]
-        return labels
-
     def _outward(self, index: int) -> list[int]:
         """The other frames in the order in which a maximum spanning tree of their overlap grows from `index` (Prim)."""
         shared = self.views.shared
@@ -158,13 +119,6 @@ class GeometricTracker:
         votes = view.votes[rows]
         owner = assign_superpixels(view, votes.T @ owned[:, classes], votes.T @ known[rows])
         return np.where(owner >= 0, classes[owner], -1)
-
-
-def _label_shares(pieces: np.ndarray, labels: np.ndarray, rows: int, columns: int) -> Sparse:
-    """Returns a sparse matrix (`rows`, `columns`): the share of the pixels of each superpixel that carry each label."""
-    inside = labels >= 0
-    weights = 1.0 / np.bincount(pieces.reshape(-1), minlength=rows)[pieces[inside]]
-    return sparse.csr_matrix((weights.astype(np.float32), (pieces[inside], labels[inside])), shape=(rows, columns))
 
 
 def _evidence(

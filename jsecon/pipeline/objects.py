@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsecon.association.consensus import Objects, clean_tracks, track_masks
+from jsecon.association.consensus import Objects, track_masks
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
@@ -234,10 +234,7 @@ def _associate_masks(
         with ThreadPoolExecutor(min(cores(), VIEWS_AT_ONCE)) as pool:
             list(pool.map(lambda t: len(proposals(t)), range(len(frames))))
     tracker = context.models.tracker or GeometricTracker(gaussians, cameras, proposals)
-    labels = masklets(frames, lambda frame, index: proposals(index), tracker, progress=progress)
-    if isinstance(tracker, GeometricTracker):
-        labels = tracker.consistent(frames, labels)
-    return Objects(clean_tracks(labels))
+    return Objects(masklets(frames, lambda frame, index: proposals(index), tracker, progress=progress))
 
 
 def _clear_ignored(labels: np.ndarray, view: _TrainingView) -> None:

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy import sparse  # loads csgraph on its first use
 
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped
@@ -27,10 +28,10 @@ from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
 from jsecon.programs import numpy_outside_traces, stored_jit
 from jsecon.query.match import (
+    MIN_FRAGMENT_OVERLAP,
     NO_REGIONS,
     RegionMatch,
     compare_words,
-    join_fragments,
     regions_with,
     score_text,
     select_node,
@@ -78,8 +79,9 @@ def answer_question(
     kept = trim(field, selection, ("all" if several else "supported") if outliers else None)
     count, overlap = 1, field.votes.overlap
     if overlap is not None and node is None and rules.code_threshold is None:
-        groups = join_fragments(np.flatnonzero(match.chosen), np.asarray(overlap))
-        count = max(1, min(len(groups), kept.clusters))
+        chosen = np.flatnonzero(match.chosen)
+        linked = np.asarray(overlap)[np.ix_(chosen, chosen)] >= MIN_FRAGMENT_OVERLAP
+        count = max(1, min(sparse.csgraph.connected_components(linked, directed=False)[0], kept.clusters))
     return _Answered(selection, kept, count)
 
 

@@ -13,10 +13,9 @@ class. `regions_with` has the rule. Relative scores are 0 at the median region a
                  piece of the object. A second object of the class is as similar, but has Gaussians of its own
     duplicate    cos(d, d_best) >= `duplicate_cosine`, d the embedding minus the mean: the same object seen twice
 
-Pure functions but for `join_fragments`.
+Pure functions.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -259,18 +258,6 @@ def _reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_
     largest = xp.where(known, similarity, -xp.inf).max()
     reach = xp.where(largest > median, largest - median, 0.0)
     return known & (similarity >= median + relative_score * reach) & (largest > median)
-
-
-def join_fragments(regions: Sequence[int] | np.ndarray, overlap: np.ndarray | None) -> list[tuple[int, ...]]:
-    """Groups regions that overlap, directly or by way of others: the fragments of one object. Host code.
-
-    The groups are sorted. None in place of `Votes.overlap` makes each region a group.
-    """
-    groups: list[set[int]] = []
-    for region in map(int, regions):
-        near = [g for g in groups if overlap is not None and (overlap[region, list(g)] >= MIN_FRAGMENT_OVERLAP).any()]
-        groups = [g for g in groups if g not in near] + [set().union({region}, *near)]
-    return sorted(tuple(sorted(group)) for group in groups)
 
 
 def select_node(field: LanguageField, node: int) -> Selection:

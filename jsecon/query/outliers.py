@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse  # loads csgraph on its first use
 from scipy.spatial import KDTree
 
-from jsecon.errors import require, require_one_of, require_shape
+from jsecon.errors import require_one_of, require_shape
 from jsecon.types import Array
 
 EPS_SPACINGS = 6.0
@@ -37,7 +37,6 @@ def remove_outliers(
     *,
     weight: Float[Array, " n"] | None = None,
     keep: str = "supported",
-    eps: float | None = None,
 ) -> Bool[np.ndarray, " n"]:
     """Removes the selected Gaussians that lie apart, by DBSCAN on their centres. Host code: it cannot be traced.
 
@@ -53,7 +52,6 @@ def remove_outliers(
       keep: "supported" keeps each cluster that has at least a tenth of the weight of the heaviest: a mask may show one
         object in several pieces. "largest" keeps the cluster with most Gaussians (the paper). "all" keeps
         every cluster.
-      eps: Radius, world units; None takes 6 times the spacing of the selection.
 
     Returns:
       (N,) bool, the mask without outliers.
@@ -61,7 +59,7 @@ def remove_outliers(
     Raises:
       ValueError: An option is out of range, or `weight` has another length.
     """
-    return split_outliers(means, mask, weight=weight, keep=keep, eps=eps).mask
+    return split_outliers(means, mask, weight=weight, keep=keep).mask
 
 
 def split_outliers(
@@ -70,12 +68,9 @@ def split_outliers(
     *,
     weight: Float[Array, " n"] | None = None,
     keep: str = "supported",
-    eps: float | None = None,
 ) -> OutlierResult:
     """Removes outliers as `remove_outliers` does, and counts the clusters that stay."""
     require_one_of("remove_outliers", keep, ("largest", "supported", "all"), "Use 'all' to keep several objects.")
-    remedy = "Leave eps out to have it follow the selection's spacing."
-    require(eps is None or eps > 0, "remove_outliers", f"eps={eps}", "eps > 0", remedy)
     if weight is not None:
         require_shape("weight", weight, (len(means),), "Give one weight per Gaussian.")
     mask = np.array(mask, bool)
@@ -86,7 +81,7 @@ def split_outliers(
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < MIN_SAMPLES:
         return OutlierResult(mask, 0)
-    eps = _default_eps(points) if eps is None else eps
+    eps = _default_eps(points)
     if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
         return OutlierResult(mask, 1)
     labels = _dbscan(points, eps)

@@ -10,20 +10,13 @@ from jaxtyping import Bool, Float
 from jsecon.errors import require_shape
 from jsecon.numerics import array_module, is_traced
 from jsecon.splat.render import render
+from jsecon.splat.visible import HIDDEN_LOGIT
 from jsecon.types import Array, Camera, Gaussians, Rendering
 
 ALPHA_THRESHOLD = 0.7
 """Alpha of OpenGaussian's silhouette (render_lerf_by_text.py)."""
 VALA_THRESHOLD = 10 / 255
 """Alpha of VALA's silhouette: lenient, it rewards faint selections; reported beside 0.7."""
-HIDDEN_LOGIT = -30.0
-"""Opacity logit of hidden Gaussians: an opacity of 1e-13 is culled in projection, and every number stays finite."""
-
-
-def hide(gaussians: Gaussians, mask: Bool[np.ndarray, " n"]) -> Gaussians:
-    """Makes some Gaussians transparent."""
-    logits = np.where(mask, np.float32(HIDDEN_LOGIT), np.asarray(gaussians.opacity_logits))
-    return dataclasses.replace(gaussians, opacity_logits=logits)
 
 
 def selection_mask(
@@ -69,16 +62,9 @@ def render_selection(
     """
     require_shape("mask", mask, (gaussians.count,), "Pass one truth value per Gaussian.")
     arrays: Any = gaussians.opacity_logits, mask, similarity
-    arrays = arrays if is_traced(arrays) else jax.tree.map(np.asarray, arrays)  # NumPy compiles no program
-    logits, features = _alone(*arrays)
-    return render(dataclasses.replace(gaussians, opacity_logits=logits), camera, features, capacity=capacity)
-
-
-def _alone(logits: Array, mask: Array, similarity: Array | None) -> tuple[Array, Array]:
-    """Returns opacity logits that hide what is not selected, and the features of each Gaussian.
-
-    The features have three columns, so that the program that renders colours serves.
-    """
+    logits, mask, similarity = arrays if is_traced(arrays) else jax.tree.map(np.asarray, arrays)  # compiles no program
     xp = array_module(logits, mask, similarity)
-    features = xp.where(mask, xp.ones_like(logits) if similarity is None else similarity, xp.zeros_like(logits))
-    return xp.where(mask, logits, HIDDEN_LOGIT), xp.broadcast_to(features[:, None], (*features.shape, 3))
+    column = xp.where(mask, xp.ones_like(logits) if similarity is None else similarity, xp.zeros_like(logits))
+    features = xp.broadcast_to(column[:, None], (*column.shape, 3))  # so that the program that renders colours serves
+    alone = dataclasses.replace(gaussians, opacity_logits=xp.where(mask, logits, HIDDEN_LOGIT))
+    return render(alone, camera, features, capacity=capacity)

@@ -7,8 +7,8 @@ T_i <G, f_i> - (S - S_i) / (1 - alpha_i), where S_i is the running sum of w <G, 
 the image: no memory per pair is needed. Symbolic zeros show whether the gradient of the geometry is needed, so that a
 field that is distilled into frozen Gaussians does not compute it.
 
-vmap: a batched loop with early exit runs as long as its slowest member. So several feature sets of one view become more
-channels of one walk over its tiles, and several views are walked one after another.
+vmap: a batched loop with early exit runs as long as its slowest member. So the members of a batch are scanned one after
+another. Pass several feature sets of one view as more channels instead.
 
 Zero times NaN is NaN, so a non-finite feature would spread to its whole tile, and through the padding of lists to other
 tiles. Such features are composited as zeros instead, and a second walk, only if there are any, marks their pixels.
@@ -257,19 +257,24 @@ def _attribute_gradient(moments: Array, attributes: Array, corners: tuple[Array,
     )
 
 
+def _forward(width: int, height: int, mesh: Mesh | None) -> Callable:
+    """`composite` of an image, which vmap calls for one member of a batch after another."""
+    return sequential_vmap(functools.partial(composite, width=width, height=height, mesh=mesh))
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
 def _rasterize_finite(
     splats: Array, features: Array, lists: TileLists, width: int, height: int, mesh: Mesh | None
 ) -> tuple[Array, Array]:
     """Composites finite features."""
-    return _forward(splats, features, lists, width, height, mesh)[:2]
+    return _forward(width, height, mesh)(splats, features, lists)[:2]
 
 
 def _rasterize_forward(splats, features, lists, width, height, mesh):
     needs_geometry = splats.perturbed
     splats, features = splats.value, features.value
     lists = jax.tree.map(lambda leaf: leaf.value, lists, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
-    image, transmittance, seen = _forward(splats, features, lists, width, height, mesh)
+    image, transmittance, seen = _forward(width, height, mesh)(splats, features, lists)
     lists = dataclasses.replace(lists, lengths=seen)
     saved = (image, transmittance) if needs_geometry else None
     return (image, transmittance), (splats, features, lists, saved)
@@ -280,7 +285,7 @@ def _rasterize_backward(width, height, mesh, residual, cotangents):
     symbolic = jax.custom_derivatives.SymbolicZero
     bars = [jnp.zeros(bar.shape, splats.dtype) if isinstance(bar, symbolic) else bar for bar in cotangents]
     if saved is None:
-        gradient = _features_backward(splats, bars[0], lists, mesh)
+        gradient = sequential_vmap(functools.partial(_composite_features_vjp, mesh=mesh))(splats, lists, bars[0])
         return jnp.zeros_like(splats), gradient.astype(features.dtype), None
     vjp = sequential_vmap(functools.partial(_composite_vjp, mesh=mesh))
     by_splat, gradient = vjp(splats, features.astype(splats.dtype), lists, *saved, *bars)
@@ -288,54 +293,6 @@ def _rasterize_backward(width, height, mesh, residual, cotangents):
 
 
 _rasterize_finite.defvjp(_rasterize_forward, _rasterize_backward, symbolic_zeros=True)
-
-
-def _forward(splats, features, lists, width: int, height: int, mesh: Mesh | None) -> tuple[Array, Array, Array]:
-    def one(splats, features, lists):
-        return composite(splats, features, lists, width, height, mesh)
-
-    def split(out, sets):
-        return (_unmerge(out[0], sets), *out[1:]), (True, False, False)
-
-    return _fold_vmap_into_channels(one, split)(splats, features, lists)
-
-
-def _features_backward(splats: Array, cotangent: Array, lists: TileLists, mesh: Mesh | None) -> Array:
-    def one(splats, cotangent, lists):
-        return _composite_features_vjp(splats, lists, cotangent, mesh)
-
-    return _fold_vmap_into_channels(one, lambda out, sets: (_unmerge(out, sets), True))(splats, cotangent, lists)
-
-
-def _fold_vmap_into_channels(one: Callable, split: Callable) -> Callable:
-    """Wraps `one(splats, channels, lists)` with a rule for vmap.
-
-    If only channels (S, ..., D) are batched, they become S D channels of one call, whose result `split(result, S)`
-    unmerges. Any other batch runs one after another.
-    """
-    function = custom_vmap(one)
-
-    @function.def_vmap
-    def rule(size, batched, splats, channels, lists):
-        if any(jax.tree.leaves((batched[0], batched[2]))):
-
-            def one_of(index):
-                def take(a, is_batched):
-                    return lax.dynamic_index_in_dim(a, index, 0, False) if is_batched else a
-
-                return function(*jax.tree.map(take, (splats, channels, lists), tuple(batched)))
-
-            out = lax.map(one_of, jnp.arange(size))
-            return out, jax.tree.map(lambda _: True, out)
-        merged = jnp.moveaxis(channels, 0, -2)
-        return split(function(splats, merged.reshape(*merged.shape[:-2], -1), lists), size)
-
-    return function
-
-
-def _unmerge(array: Array, sets: int) -> Array:
-    """(..., S D) -> (S, ..., D)."""
-    return jnp.moveaxis(array.reshape(*array.shape[:-1], sets, -1), -2, 0)
 
 
 def rasterize(

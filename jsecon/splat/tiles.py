@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float, Int, UInt
+from jaxtyping import Int, UInt
 
 from jsecon.errors import require
 from jsecon.splat.fusion import compute_once
@@ -81,55 +81,26 @@ def pair_counts(projection: Projection, width: int, height: int, *, strip: Strip
     return (x1 - x0) * (y1 - y0)
 
 
-def _depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
-    """Sorts positive depths, ties in index order.
-
-    Positive float32 sort like their bits, so depth and index pack into one 64-bit key: XLA's CPU sort of one key is
-    about five times faster than its sort of a key and a value. Float64 depths use a stable argsort.
-    """
-    if depths.dtype != jnp.float32:
-        return jnp.argsort(depths, stable=True).astype(jnp.int32)
-    bits = lax.bitcast_convert_type(depths, jnp.uint32)
-    return _sort_packed((bits, 32), (lax.iota(jnp.uint32, depths.shape[0]), 32))[1]
-
-
-def _sort_packed(*fields: tuple[Array, int]) -> list[Array]:
-    """Sorts by fields of non-negative integers, the most significant first; returns the sorted fields as int32.
-
-    Each field comes with its number of bits, at most 64 together. 64-bit types are enabled only inside.
-    """
-    with jax.enable_x64(True):
-        wide = [lax.convert_element_type(values, jnp.uint64) for values, _ in fields]
-        key = wide[0]
-        for values, (_, bits) in zip(wide[1:], fields[1:], strict=True):
-            key = lax.shift_left(key, lax.full_like(key, bits)) | values
-        key = lax.sort(key, is_stable=False)
-        out = []
-        for _, bits in reversed(fields):
-            out.append(lax.convert_element_type(key & lax.full_like(key, (1 << bits) - 1), jnp.int32))
-            key = lax.shift_right_logical(key, lax.full_like(key, min(bits, 63)))
-    return out[::-1]
-
-
 def _sorted_pairs(blocks: Array, owner: Array, depths: Array, number: int) -> tuple[Array, Array]:
     """(blocks, owner) sorted by block (0 .. number), then by depth and index of the owner.
 
-    Block, depth and index form one key if they fit 64 bits (depths in view are positive); otherwise the depths are
-    sorted first, and their ranks replace both.
+    Positive float32 sort like their bits, so block, depth and index pack into one key if they fit 64 bits: XLA's CPU
+    sort of one key is about five times faster than its sort of several. 64-bit types are enabled only inside.
     """
     for_block, for_index = number.bit_length(), max((depths.shape[0] - 1).bit_length(), 1)
-    if depths.dtype == jnp.float32 and for_block + 31 + for_index <= 64:
-        bits = lax.bitcast_convert_type(depths, jnp.uint32)[owner]
-        blocks, _, owner = _sort_packed((blocks, for_block), (bits, 31), (owner, for_index))
+    if depths.dtype != jnp.float32 or for_block + 31 + for_index > 64:
+        blocks, _, owner = lax.sort((blocks, depths[owner], owner), num_keys=3, is_stable=False)
         return blocks, owner
-    return _sorted_pairs_by_rank(blocks, owner, depths)
-
-
-def _sorted_pairs_by_rank(blocks: Array, owner: Array, depths: Array) -> tuple[Array, Array]:
-    order = _depth_order(depths)
-    ranks = jnp.zeros_like(order).at[order].set(lax.iota(jnp.int32, order.shape[0]), unique_indices=True)
-    blocks, rank = _sort_packed((blocks, 32), (ranks[owner], 32))
-    return blocks, order[rank]
+    bits = lax.bitcast_convert_type(depths, jnp.uint32)[owner]
+    with jax.enable_x64(True):
+        wide = [lax.convert_element_type(values, jnp.uint64) for values in (blocks, bits, owner)]
+        key = wide[0]
+        for values, size in zip(wide[1:], (31, for_index)):
+            key = lax.shift_left(key, lax.full_like(key, size)) | values
+        key = lax.sort(key, is_stable=False)
+        owner = lax.convert_element_type(key & lax.full_like(key, (1 << for_index) - 1), jnp.int32)
+        blocks = lax.shift_right_logical(key, lax.full_like(key, 31 + for_index))
+        return lax.convert_element_type(blocks, jnp.int32), owner
 
 
 def tile_lists(
@@ -161,8 +132,11 @@ def tile_lists(
     # Pairs are laid out Gaussian after Gaussian; `owner` is the Gaussian of each. The cumulative sum saturates instead
     # of wrapping at 2^31 pairs: beyond the capacity its exact value affects only the overflow.
     areas = (x1 - x0) * (y1 - y0)
-    can_wrap = len(areas) * number >= 2**31
-    ends = _saturating_cumsum(areas) if can_wrap else jnp.cumsum(areas, dtype=jnp.int32)
+    ends = jnp.cumsum(areas, dtype=jnp.int32)
+    if len(areas) * number >= 2**31:
+        with jax.enable_x64(True):
+            wide = lax.cumsum(lax.convert_element_type(areas, jnp.int64))
+            ends = lax.convert_element_type(lax.min(wide, lax.full_like(wide, 2**31 - 1)), jnp.int32)
     starts, total = ends - areas, jnp.minimum(ends[-1], capacity)
     marks = jnp.zeros(room + 1, jnp.int32).at[jnp.minimum(starts, room)].add(1, mode="promise_in_bounds")
     boxes = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)
@@ -245,15 +219,6 @@ def _reached_tiles(
             beside |= left + (column * tile + 0.5) - slack > rims[1]
             bits |= jnp.where(missed | beside, jnp.uint32(0), jnp.uint32(1 << (row * BLOCK + column)))
     return jnp.where(blocks < number, bits, jnp.uint32(0))
-
-
-def _saturating_cumsum(areas: Array) -> Array:
-    """int32 cumulative sum that saturates instead of wrapping."""
-    largest = jnp.iinfo(jnp.int32).max
-    exact = jnp.cumsum(areas.astype(jnp.int32))
-    approximate = jnp.cumsum(areas.astype(jnp.float32))
-    wrapped = lax.cummax((approximate > 0.99 * largest).astype(jnp.int32)) > 0
-    return jnp.where(wrapped, largest, exact)
 
 
 def _loop_in_chunks(total: Array, size: int, step: Callable[[Array, Any], Any], carry: Any) -> Any:

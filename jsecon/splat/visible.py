@@ -21,6 +21,14 @@ from jsecon.types import Array, Camera, Gaussians
 
 ROWS = 1 << 18
 """Gaussians of a block."""
+HIDDEN_LOGIT = -30.0
+"""Opacity logit of hidden Gaussians: an opacity of 1e-13 is culled in projection, and every number stays finite."""
+
+
+def hide(gaussians: Gaussians, mask: Bool[np.ndarray, " n"]) -> Gaussians:
+    """Makes some Gaussians transparent; all columns but that of the opacities are shared."""
+    logits = np.where(mask, np.float32(HIDDEN_LOGIT), np.asarray(gaussians.opacity_logits))
+    return dataclasses.replace(gaussians, opacity_logits=logits)
 
 
 def visible_rows(

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from jsecon.field.evidence import MAX_WHOLE, each_view, view_evidence
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render_depth
-from jsecon.splat.visible import geometry_of_rows, visible_rows
+from jsecon.splat.visible import geometry_of_rows, hide, visible_rows
 from jsecon.types import Camera, Gaussians, Progress
 
 KINDS = ("kept", "unseen", "faint", "haze", "floaters")
@@ -82,16 +82,6 @@ def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None
     return np.where(peak <= 0, 1, np.where(peak < FAINT, 2, kinds)).astype(np.int8)
 
 
-def without(gaussians: Gaussians, gone: np.ndarray) -> Gaussians:
-    """Makes some Gaussians (N,) transparent; all columns but that of the opacities are shared."""
-    return _with_opacity(gaussians, ~gone)
-
-
-def _with_opacity(gaussians: Gaussians, kept: np.ndarray) -> Gaussians:
-    logits = np.where(kept, np.asarray(gaussians.opacity_logits), np.float32(-np.inf))
-    return dataclasses.replace(gaussians, opacity_logits=logits)
-
-
 def _is_apart(
     means: Float[np.ndarray, "n 3"],
     reach: Float[np.ndarray, " n"],
@@ -145,7 +135,7 @@ def _view(
 
     The surface is that of the Gaussians that are `seen`.
     """
-    depth, alpha = map(np.asarray, render_depth(_with_opacity(gaussians, seen), camera, capacity=capacity))
+    depth, alpha = map(np.asarray, render_depth(hide(gaussians, ~seen), camera, capacity=capacity))
     shown = (alpha >= _LEAST_ALPHA) & (depth > 0)
     nearest = float(depth[shown].min(initial=np.inf))
     bins = np.where(shown, np.log(np.where(shown, depth, 1) / nearest) / np.log1p(_STEP), -1).astype(np.int32)
