@@ -20,7 +20,6 @@ from jsecon.field.membership import (
     CORRELATION,
     _add_visible_weight,
     inside_fraction,
-    inside_fraction_of_mapped,
     inside_fraction_of_regions,
     membership_probability,
     normalise_votes,
@@ -136,8 +135,7 @@ def test_the_share_of_a_few_regions_without_a_program_has_the_same_bits(shown):
     votes = dataclasses.replace(votes, weights=weights, views=np.arange(700, dtype=np.int32) % 9)
     for regions in ([], [0], [2, 1], range(REGIONS)):
         expected = inside_fraction(jax.tree.map(jnp.asarray, votes), np.isin(np.arange(REGIONS), list(regions)))
-        for function in (inside_fraction_of_regions, inside_fraction_of_mapped):
-            jax.tree.map(np.testing.assert_array_equal, function(votes, list(regions)), expected)
+        jax.tree.map(np.testing.assert_array_equal, inside_fraction_of_regions(votes, list(regions)), expected)
 
 
 def test_numbers_that_are_not_finite_are_not_known_where_they_are_asked_for():

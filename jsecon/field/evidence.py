@@ -196,13 +196,9 @@ def view_evidence(
     camera: Camera,
     labels: Shaped[np.ndarray, "h w"],
     num_regions: int,
-    *,
-    centre_pixel_weight: float = 0.0,
-    capacity: int | None = None,
-    near: float = NEAR,
+    **options: Any,
 ) -> ViewEvidence:
-    """Lists what one view casts on N Gaussians; options as for `region_votes`. Host code."""
-    options = {"centre_pixel_weight": centre_pixel_weight, "capacity": capacity, "near": near}
+    """Lists what one view casts on N Gaussians; options as for `plan_evidence`. Host code."""
     return plan_evidence(gaussians, camera, **options)(labels, num_regions)
 
 
@@ -214,7 +210,10 @@ def plan_evidence(
     capacity: int | None = None,
     near: float = NEAR,
 ) -> CastLabels:
-    """Plans a view once; the function that it returns is `view_evidence` of any labels. Host code."""
+    """Plans a view once; the function that it returns is `view_evidence` of any labels. Host code.
+
+    Options as for `region_votes`.
+    """
     rows = None
     if not gaussians.count:
         nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)

@@ -24,7 +24,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.field.columns import is_mapped, row_slices, votes_of_rows
+from jsecon.field.columns import ROWS, is_mapped, row_slices, votes_of_rows
 from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
 from jsecon.numerics import FULL_PRECISION, array_module, cosine_matrix, inline_jit
 from jsecon.process import cores
@@ -241,27 +241,25 @@ def _add_columns(votes: Votes, inside: Callable[[Array], Array]) -> _InsideFract
 
 
 def inside_fraction_of_regions(votes: Votes, regions: Sequence[int] | np.ndarray) -> _InsideFraction:
-    """Computes the same bits as `inside_fraction` with NumPy, for a few regions: it compiles no program. Host code."""
-    return _add_columns(jax.tree.map(np.asarray, votes), lambda region: np.isin(region, regions))
+    """Computes the same bits as `inside_fraction` with NumPy: it compiles no program. Host code.
 
-
-def inside_fraction_of_mapped(votes: Votes, regions: Sequence[int] | np.ndarray) -> _InsideFraction:
-    """Computes the same bits as `inside_fraction` of memory-mapped votes. Host code.
-
-    Columns but that of the regions are read only where a Gaussian has a vote for one of them.
+    Mapped votes stay on disk: columns but that of the regions are read only where a Gaussian has a vote for one of
+    these.
     """
+    votes = jax.tree.map(np.asarray, votes)
     count, places = votes.regions.shape
-    fraction, known = np.zeros(count, np.float32), np.zeros(count, bool)
+    fraction, known = np.zeros(count, votes.weights.dtype), np.zeros(count, bool)
     chosen = np.zeros(votes.num_regions + 1, bool)  # the last is that of no vote, -1
     chosen[regions] = True
 
-    def add(rows: slice) -> None:
-        voted = np.flatnonzero(np.take(chosen, votes.regions[rows], mode="wrap"))  # any further id is looked at below
-        own = rows.start + np.unique(voted // places)
-        fraction[own], known[own] = inside_fraction_of_regions(votes_of_rows(votes, own), regions)
+    def add(first: int) -> None:
+        voted = np.take(chosen, votes.regions[first : first + ROWS], mode="wrap")  # any further id is looked at below
+        own = first + np.unique(np.flatnonzero(voted) // places)
+        inside = _add_columns(votes_of_rows(votes, own), lambda region: np.isin(region, regions))
+        fraction[own], known[own] = inside
 
     with ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(add, row_slices(votes, count)))
+        list(pool.map(add, range(0, count, ROWS)))
     return _InsideFraction(fraction, known)
 
 

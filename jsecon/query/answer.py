@@ -22,7 +22,7 @@ from scipy import sparse  # loads csgraph on its first use
 
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped
-from jsecon.field.membership import inside_fraction, inside_fraction_of_mapped, inside_fraction_of_regions
+from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
@@ -195,8 +195,7 @@ def select_gaussians(field: LanguageField, match: RegionMatch, rules: QueryRules
     few = len(field.votes.views) <= 1 << 17  # of so few NumPy selects in 10 ms; to compile a program takes a second
     if is_traced((field.votes, match, rules)) or not (few or is_mapped(field.votes)):
         return _select_from_votes(jax.tree.map(jnp.asarray, field.votes), match, rules.min_share)
-    fraction = inside_fraction_of_regions if few else inside_fraction_of_mapped
-    share, known = fraction(field.votes, np.flatnonzero(match.chosen))
+    share, known = inside_fraction_of_regions(field.votes, np.flatnonzero(match.chosen))
     return Selection(known & (share >= rules.min_share) & (np.asarray(match.region) >= 0), share, *match[1:])
 
 
