@@ -6,6 +6,7 @@ from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
+from jsecon.association import scene as association
 from jsecon.association.consensus import (
     _average_linkage,
     _coplanarity,
@@ -30,6 +31,11 @@ def linkage(*args, **options):
 
 def group(*args, **options):
     return _group_by_consensus(*args, **options).owner
+
+
+@pytest.fixture(autouse=True)
+def few_superpixels(monkeypatch):
+    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 60)
 
 
 def scene_of(world, proposals):
@@ -65,7 +71,7 @@ def test_finds_the_three_balls_and_the_floor(world, scene):
     assert calls[-1] == (VIEWS, VIEWS)
 
 
-def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
+def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world, monkeypatch):
     _, _, frames, truth, proposals = world
     worse = list(proposals)
     for t in (2, 9, 16):
@@ -74,6 +80,7 @@ def test_frames_that_merge_cut_or_propose_nothing_are_outvoted(world):
     for t in (5, 12):
         worse[t] = np.concatenate([proposals[t] & left, proposals[t] & ~left])
     worse[20] = np.zeros((0, HEIGHT, WIDTH), bool)
+    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 300)
     labels = as_truth(track_masks(frames, scene_of(world, worse)).labels, truth)
     scores = ious(labels - 1, truth, 3)
     assert np.nanmean(scores) > 0.85
@@ -90,7 +97,7 @@ def test_what_shows_no_gaussians_is_no_object(world):
     assert all((labels[truth == ball] >= 0).mean() > 0.9 for ball in (1, 2, 3))
 
 
-def test_what_some_views_cut_has_a_common_node(world):
+def test_what_some_views_cut_has_a_common_node(world, monkeypatch):
     """Half of the views cut a ball into its upper and its lower half; no view joins two balls."""
     _, _, frames, truth, proposals = world
     cut = list(proposals)
@@ -98,6 +105,7 @@ def test_what_some_views_cut_has_a_common_node(world):
         rows = np.flatnonzero((truth[t] == 1).any(1))
         upper = np.arange(HEIGHT)[:, None] < rows.mean() if len(rows) else np.ones((HEIGHT, 1), bool)
         cut[t] = np.concatenate([proposals[t] & upper, proposals[t] & ~upper])
+    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 300)
     scene = scene_of(world, cut)
     found = track_masks(frames, scene, agreement=0.8)
     count = int(found.labels.max()) + 1
@@ -119,7 +127,7 @@ def test_what_some_views_cut_has_a_common_node(world):
         assert max((half & found).sum() / (half | found).sum() for found in members[count:]) > 0.55
 
 
-def test_parts_that_masks_show_alone_are_labelled(world):
+def test_parts_that_masks_show_alone_are_labelled(world, monkeypatch):
     """Every view has a mask of a whole ball and masks of its halves: the object has two parts, those of the masks."""
     _, _, frames, truth, proposals = world
     layered = list(proposals)
@@ -129,6 +137,7 @@ def test_parts_that_masks_show_alone_are_labelled(world):
             upper = np.arange(HEIGHT)[:, None] < rows.mean()
             halves = np.stack([(truth[t] == 1) & upper, (truth[t] == 1) & ~upper])
             layered[t] = np.concatenate([proposals[t], halves])
+    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 300)
     found = track_masks(frames, scene_of(world, layered))
     count, ball = int(found.labels.max()) + 1, int(np.bincount(found.labels[truth == 1] + 1).argmax()) - 1
     assert found.parts.shape[1:] == found.labels.shape

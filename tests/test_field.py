@@ -191,13 +191,9 @@ ALONE = [-1] * REGIONS
 
 
 @pytest.mark.parametrize(("tree", "leaf", "problem"), [
-    (ALONE[1:], -1, "a tree whose nodes"), ([1, *ALONE[1:]], -1, "a tree whose nodes"),
-    ([REGIONS, *ALONE[1:]], -1, "a tree whose nodes"), ([-1.0] * REGIONS, -1, "a tree whose nodes"),
-    ([REGIONS, *ALONE[1:], 0], -1, "a tree whose nodes"),
     (ALONE, None, "a tree without the smallest nodes"), (ALONE, REGIONS, "beyond"),
 ])  # fmt: skip
-def test_a_tree_that_is_none_or_not_of_its_gaussians_is_refused(field, tmp_path, tree, leaf, problem):
-    """Too few nodes, a region under a region, a parent that is not there, no integers, a circle."""
+def test_a_tree_that_is_not_of_its_gaussians_is_refused(field, tmp_path, tree, leaf, problem):
     leaf = None if leaf is None else np.full(field.gaussians.count, leaf, np.int32)
     with pytest.raises(ValueError, match=problem):
         save_field(tmp_path / "field.safetensors", dataclasses.replace(field, tree=np.array(tree), leaf=leaf))

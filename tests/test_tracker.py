@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from balls import HEIGHT, WIDTH, ious, ring_of_balls
 
+from jsecon.association import scene as association
 from jsecon.association.scene import superpixels
 from jsecon.paper.tracker import GeometricTracker
 from jsecon.vision.protocols import Tracker
@@ -16,6 +17,11 @@ def world():
 def tracker(world):
     gaussians, cameras, _, _, proposals = world
     return GeometricTracker(gaussians, cameras, proposals)
+
+
+@pytest.fixture(autouse=True)
+def few_superpixels(monkeypatch):
+    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 60)
 
 
 def prompts_at(truth, t):
@@ -35,11 +41,12 @@ def test_follows_each_ball_around_the_ring(world, tracker):
         assert (tracker(frames, start, none) == -1).all()
 
 
-def test_where_a_frame_proposes_nothing_or_a_merger_the_gaussians_find_the_ball(world):
+def test_where_a_frame_proposes_nothing_or_a_merger_the_gaussians_find_the_ball(world, monkeypatch):
     gaussians, cameras, frames, truth, proposals = world
     worse = list(proposals)
     worse[13] = np.zeros((0, HEIGHT, WIDTH), bool)
     worse[14] = (truth[14] >= 0)[None]  # everything is one region
+    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 300)
     tracker = GeometricTracker(gaussians, cameras, lambda t: worse[t])
     scores = ious(tracker(frames, 12, prompts_at(truth, 12)), truth, 3)
     assert np.nanmin(scores[[13, 14]]) > 0.5

@@ -94,6 +94,10 @@ def _require_utf8(text: str) -> None:
         raise InputError("", f"the text {text!r} is not UTF-8", remedy=remedy)
 
 
+class _Unreadable(ValueError):
+    """What is wrong with an expression, in words."""
+
+
 class _Token(NamedTuple):
     """A word, or words that are one name."""
 
@@ -246,9 +250,12 @@ def _needs_grammar(text: str) -> bool:
     counted, tokens = _question(_tokens(text))
     if counted or not tokens or _asks_for_property(text):
         return bool(tokens)
-    parts, relations, _, problem = _split(tokens)
-    phrase, quantified, unknown = _noun_phrase(parts[0])
-    return bool(relations or problem or quantified or phrase.order or unknown) or tokens[0].key in _WORDS["everything"]
+    try:
+        parts, relations, _ = _split(tokens)
+        phrase, quantified = _noun_phrase(parts[0])
+    except _Unreadable:
+        return True
+    return bool(relations or quantified or phrase.order) or tokens[0].key in _WORDS["everything"]
 
 
 def parse_expression(text: str) -> _Expression:
@@ -273,23 +280,22 @@ def parse_expression(text: str) -> _Expression:
         word = "but not" if _alternatives(text)[1] else "or"
         problem = f'"{word}" cannot be combined with relations, orders and numbers'
         raise InputError(where, problem, remedy=f"Ask for each alone. {_REMEDY}")
+    try:
+        return _read_tokens(tokens, adds)
+    except _Unreadable as error:
+        raise InputError(where, str(error), remedy=_REMEDY) from None
+
+
+def _read_tokens(tokens: list[_Token], adds: str) -> _Expression:
+    """Parses the words of an expression."""
     counted, tokens = _question(tokens)
-    parts, relations, joined, problem = _split(tokens)
-    if problem:
-        raise InputError(where, problem, remedy=_REMEDY)
-
-    def read(part: Sequence[_Token], related: bool, anchor: bool = True) -> NounPhrase:
-        phrase, _, problem = _noun_phrase(part, related, anchor)
-        if problem:
-            raise InputError(where, problem, remedy=_REMEDY)
-        return phrase
-
-    thing = read(parts[0], bool(relations), anchor=False)
+    parts, relations, joined = _split(tokens)
+    thing, _ = _noun_phrase(parts[0], bool(relations))
     conditions = []
     for place, (condition, part) in enumerate(zip(relations, parts[1:])):
         between = condition.relation == "between"
         anchors = _two_anchors(part) if between else [part]
-        things = [read(anchor, place + 1 < len(relations)) for anchor in anchors]
+        things = [_noun_phrase(words, place + 1 < len(relations), anchor=True)[0] for words in anchors]
         if between and len(things) == 1:
             things = [dataclasses.replace(things[0], every=True)]
         conditions.append(dataclasses.replace(condition, anchors=tuple(things)))
@@ -334,9 +340,6 @@ def _with_names(tokens: list[_Token]) -> list[_Token]:
     while place < len(tokens):
         name = _longest(tokens, place, _FIXED_NAMES)
         length = 1 if name is None else len(name)
-        several = _number(tokens[place].key) is not None and [t.key for t in tokens[place + 1 : place + 3]]
-        if several in (["in", "one"], ["in", "1"]):
-            length = 3
         words = tokens[place : place + length]
         result.append(words[0] if length == 1 else _Token(" ".join(word.text for word in words), ""))
         place += length
@@ -407,10 +410,10 @@ def _is_plural(tokens: Sequence[_Token], *, counted: bool = False) -> bool:
     return head in _WORDS["plural"] or (ends and not singular)
 
 
-def _split(tokens: list[_Token]) -> tuple[list[list[_Token]], list[Condition], bool, str]:
+def _split(tokens: list[_Token]) -> tuple[list[list[_Token]], list[Condition], bool]:
     """Splits words into those of the objects and the relations between them; and whether "and" joins these.
 
-    The relations come without their anchors. The last value is what is wrong; empty if nothing is.
+    The relations come without their anchors.
     """
     parts: list[list[_Token]] = [[]]
     relations: list[Condition] = []
@@ -424,21 +427,20 @@ def _split(tokens: list[_Token]) -> tuple[list[list[_Token]], list[Condition], b
             continue
         words = " ".join(token.text for token in tokens[place : place + length])
         if exact := _LENGTH_AT_END.search(" ".join(token.key for token in parts[-1])):
-            return parts, relations, joined, f"the distance '{exact[0]} {words}' is not understood. {_DISTANCES}"
+            raise _Unreadable(f"the distance '{exact[0]} {words}' is not understood. {_DISTANCES}")
         parts[-1] = _without_fillers(parts[-1])
         if relations and parts[-1] and parts[-1][-1].key == "and":
             parts[-1].pop()
             joined = True
         if not named or not parts[-1]:
-            return parts, relations, joined, f"no object stands before {words!r}"
+            raise _Unreadable(f"no object stands before {words!r}")
         relations.append(condition)
         parts.append([])
         place += length
     if len(relations) > MAX_RELATIONS:
         names = ", ".join(condition.relation for condition in relations)
-        problem = f"it has {len(relations)} relations ({names}), and {MAX_RELATIONS} are understood"
-        return parts, relations, joined, problem
-    return (*_with_late_anchor(parts, relations), joined, "")
+        raise _Unreadable(f"it has {len(relations)} relations ({names}), and {MAX_RELATIONS} are understood")
+    return (*_with_late_anchor(parts, relations), joined)
 
 
 def _relation_at(tokens: Sequence[_Token], place: int, named: bool) -> tuple[Condition | None, int]:
@@ -543,10 +545,10 @@ def _with_late_anchor(
     return [head[: orders[0]] + head[orders[0] + 1 : late[0]], anchor], [Condition(relation, ())]
 
 
-def _noun_phrase(tokens: Sequence[_Token], related: bool = False, anchor: bool = False) -> tuple[NounPhrase, bool, str]:
+def _noun_phrase(tokens: Sequence[_Token], related: bool = False, anchor: bool = False) -> tuple[NounPhrase, bool]:
     """Reads an object with its determiner, number and order; `related` if a relation follows, `anchor` if one precedes.
 
-    Also returns whether it has a number or a word such as "all", and what is wrong; empty if nothing is.
+    Also returns whether it has a number or a word such as "all".
     """
     order, number, among, rank, every, definite, partitive = None, None, None, 1, False, False, False
     ordinal = ""
@@ -591,13 +593,15 @@ def _noun_phrase(tokens: Sequence[_Token], related: bool = False, anchor: bool =
     quantified = every or number is not None
     keys = [token.key for token in tokens]
     if not tokens or (len(tokens) == 1 and keys[0] in {*_WORDS["determiners"], *_WORDS["every"]}):
-        return NounPhrase(""), quantified, "an object is missing"
-    exact = _BARE_LENGTH.search(" ".join(keys))
-    if exact:
-        return NounPhrase(""), quantified, f"the distance {exact[0]!r} is not understood. {_DISTANCES}"
+        raise _Unreadable("an object is missing")
+    if exact := _BARE_LENGTH.search(" ".join(keys)):
+        raise _Unreadable(f"the distance {exact[0]!r} is not understood. {_DISTANCES}")
     if (len(keys) == 1 and keys[0] in _WORDS["pronouns"]) or (keys[-1] == "one" and keys[-2] in _WORDS["adjectives"]):
-        return NounPhrase(""), quantified, f"the word {keys[-1]!r} names no object"
-    unknown = _unknown_word(keys, definite, related, anchor) or (ordinal if order is None else "")
+        raise _Unreadable(f"the word {keys[-1]!r} names no object")
+    if unknown := _unknown_word(keys, definite, related, anchor) or (ordinal if order is None else ""):
+        understood = ", ".join([*RELATIONS, *ORDERS])
+        problem = f"the word {unknown!r} is not understood as a relation or an order. Understood are {understood}"
+        raise _Unreadable(problem)
     several = (number or 0) > 1
     if number == 1 and not every and order is not None:
         number = None
@@ -605,10 +609,7 @@ def _noun_phrase(tokens: Sequence[_Token], related: bool = False, anchor: bool =
     every = every or several or _is_plural(tokens) or (anything and keys[0] in _WORDS["everything"])
     every = every and (order is None or several)
     text = ANY_OBJECT if anything else " ".join(token.text for token in tokens)
-    phrase = NounPhrase(text, order, rank, number, every, among)
-    understood = ", ".join([*RELATIONS, *ORDERS])
-    problem = f"the word {unknown!r} is not understood as a relation or an order. Understood are {understood}"
-    return phrase, quantified, problem if unknown else ""
+    return NounPhrase(text, order, rank, number, every, among), quantified
 
 
 def _tells_apart(keys: Sequence[str], place: int, definite: bool) -> bool:

@@ -16,14 +16,10 @@ from jsecon.types import Array, Camera, Gaussians
 
 @functools.partial(jax.jit, static_argnums=2)
 def _pairs_in_view(gaussians: Gaussians, camera: Camera, strips: int, near: float | Array) -> Array:
-    """(2,) pairs of the image as one strip, and as `strips` strips that are all as long as the longest."""
+    """() pairs of an image in strips that are all as long as the longest."""
     splats = project(gaussians, camera, near=near)
-
-    def longest(count: int) -> Array:
-        counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, count)) for k in range(count)]
-        return count * jnp.stack([pairs.astype(jnp.float32).sum() for pairs in counts]).max()
-
-    return jnp.stack([longest(1), longest(strips)])
+    counts = [pair_counts(splats, camera.width, camera.height, strip=Strip(k, strips)) for k in range(strips)]
+    return strips * jnp.stack([pairs.astype(jnp.float32).sum() for pairs in counts]).max()
 
 
 def round_capacity(pairs: int) -> int:
@@ -79,12 +75,7 @@ def plan_capacity(
     Returns:
       Number of pairs, rounded up (`round_capacity`).
     """
-    local = jax.local_device_count()
-    strips = local if devices is None else devices
-    compiled_strips, column = (local, 0) if strips == 1 else (strips, 1)
+    strips = jax.local_device_count() if devices is None else devices
     views = cameras if cameras.world_to_camera.ndim == 3 else jax.tree.map(lambda a: jnp.asarray(a)[None], cameras)
-    pairs = max(
-        (float(_pairs_in_view(gaussians, view, compiled_strips, near)[column]) for view in views),
-        default=0.0,
-    )
+    pairs = max((float(_pairs_in_view(gaussians, view, strips, near)) for view in views), default=0.0)
     return round_capacity(int(np.ceil(pairs * margin * (1 + 1e-6))))  # the sum is a float32

@@ -223,22 +223,11 @@ def render_plan(
     """
     require_shape("features", features, (plan.splats.shape[0], "D"), "Pass one row of features per Gaussian.")
     _require_background(background, features.shape[1])
-    if not plan.splats.shape[0]:
-        return _empty_rendering(plan, features.shape[1], background, depth)
     traced = is_traced((plan, features, background))
     run = _composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
     if not traced and not depth and jax.default_backend() == "cpu":
         finite = finite or bool(np.isfinite(np.asarray(features)).all())
     return run(plan, features, background, depth, finite)
-
-
-def _empty_rendering(plan: ViewPlan, channels: int, background: Array | None, depth: bool) -> Rendering:
-    """The rendering of a plan without Gaussians."""
-    image = jnp.zeros((plan.height, plan.width, channels), plan.splats.dtype)
-    image = jnp.where(plan.camera_is_finite, image, jnp.nan)
-    alpha = jnp.where(plan.camera_is_finite, jnp.zeros(image.shape[:2], image.dtype), jnp.nan)
-    image = image if background is None else image + jnp.reshape(background, (1, 1, -1))
-    return Rendering(image, alpha, plan.overflow, alpha if depth else None)
 
 
 def _require_background(background: Array | None, channels: int) -> None:
