@@ -152,9 +152,9 @@ def test_unseen_gaussians_get_no_code_and_unlabelled_pixels_count_in_the_denomin
     scene, cameras, labels, codes, _, _ = task
     behind = dataclasses.replace(scene, means=scene.means.at[0].set(jnp.asarray([0.0, 50.0, 0.0])))
     options = {"steps": 3, "key": KEY}
-    got, _ = distill_l1(behind, cameras, labels, codes, init="random", **options)
+    got, _ = distill_l1(behind, cameras, labels, codes, **options)
     assert (np.asarray(got[0]) == 0).all()
-    _, history = distill_l1(scene, cameras, jnp.full_like(labels, -1), codes, init="random", **options)
+    _, history = distill_l1(scene, cameras, jnp.full_like(labels, -1), codes, **options)
     assert (np.asarray(history) == 0).all()
 
 
@@ -164,10 +164,9 @@ def test_shapes_that_disagree_are_told(task):
         ({"labels": labels[:2]}, "labels"),
         ({"labels": labels[:, :3]}, "labels"),
         ({"region_codes": codes[:0]}, "labels below 0"),
-        ({"init": "mean"}, "init: got 'mean'"),
         ({"init": jnp.zeros((3, 3))}, "init"),
         ({"steps": 0}, "0 steps"),
     ):
-        given = {"labels": labels, "region_codes": codes, "steps": 1, "init": "zero"} | wrong
+        given = {"labels": labels, "region_codes": codes, "steps": 1} | wrong
         with pytest.raises(ValueError, match=match):
             distill_l1(scene, cameras, key=KEY, **given)

@@ -49,5 +49,5 @@ def train_langsplat(evidence: Evidence, *, key: Array, steps: int = STEPS, **tra
     autoencoder = train_autoencoder(jnp.asarray(evidence.embeddings), latent=LATENT, key=coder_key, **training)
     table = encode(autoencoder, jnp.asarray(evidence.embeddings))
     given = with_room(evidence.gaussians), evidence.cameras, jnp.asarray(evidence.masks), table
-    codes, history = distill_l1(*given, steps=steps, key=code_key, init="random")
+    codes, history = distill_l1(*given, steps=steps, key=code_key)
     return LangSplat(codes[: evidence.gaussians.count], autoencoder, history)

@@ -81,9 +81,7 @@ def field_of(
     if steps is None:
         codes = distill_votes(votes, table)
     else:
-        codes, _ = distill_l1(
-            with_room(evidence.gaussians), evidence.cameras, found, table, steps=steps.paper, key=key, init="random"
-        )
+        codes, _ = distill_l1(with_room(evidence.gaussians), evidence.cameras, found, table, steps=steps.paper, key=key)
         codes = codes[: evidence.gaussians.count]
     return LanguageField(
         evidence.gaussians,

@@ -99,7 +99,7 @@ class _Distillation(NamedTuple):
     """What `distill_l1` trains. A loss is NaN for a view that overflowed the capacity."""
 
     codes: Float[Array, "n d"]
-    """Unit; zero for Gaussians that no labelled pixel sees, unless `init` gave them a code."""
+    """Unit; zero for Gaussians that no labelled pixel sees, unless `init` gives them a code."""
     losses: Float[Array, " steps"]
     """Before each step."""
 
@@ -112,7 +112,7 @@ def distill_l1(
     *,
     steps: int,
     key: Key,
-    init: str | Float[Array, "n d"] = "zero",
+    init: Float[Array, "n d"] | None = None,
 ) -> _Distillation:
     """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`rendered_l1`), with rate 0.0025.
 
@@ -125,10 +125,10 @@ def distill_l1(
       region_codes: (R, d) codes of the regions.
       steps: Number of steps.
       key: Random key of the order of views and of random codes.
-      init: "zero" is LangSplat's, and a trap: the gradient through `f / (|f| + 1e-9)` at zero is 1e9 times too large,
-        Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves from the corner of
-        the cube that its first step took it to. "random" (of length 0.01, which turns within tens of steps) or (N, d)
-        codes, such as those of `distill_votes`, escape it.
+      init: (N, d) codes to start from, such as those of `distill_votes`; None takes random ones of length 0.01, which
+        turn within tens of steps. LangSplat's zeros are a trap: the gradient through `f / (|f| + 1e-9)` at zero is 1e9
+        times too large, Adam's second moment remembers it for about 15,000 steps, and until then a code hardly moves
+        from the corner of the cube that its first step took it to.
 
     Returns:
       The codes and the losses.
@@ -144,11 +144,8 @@ def distill_l1(
     some = min(views, steps, len(region_codes)) > 0
     require(some, "distill_l1", sizes, "at least one of each", "Give what is to be distilled.")
     order_key, init_key = jax.random.split(key)
-    if isinstance(init, str):
-        require_one_of("init", init, ("zero", "random"), "Where you have votes, start from distill_votes(...).")
-        features = jnp.zeros(shape, dtype)
-        if init == "random":
-            features = 0.01 * normalize(jax.random.normal(init_key, shape, dtype))
+    if init is None:
+        features = 0.01 * normalize(jax.random.normal(init_key, shape, dtype))
     else:
         require_shape("init", init, shape, "Give one row per Gaussian, of the regions' code size.")
         features = jnp.asarray(init, dtype)
@@ -165,7 +162,7 @@ def distill_l1(
         finite = not bool(jnp.isnan(losses).any())
         require(finite, "distill_l1", "a loss that is NaN", "finite Gaussians and codes", remedy)
     codes = normalize(trained)
-    if isinstance(init, str) and init == "random":
+    if init is None:
         # What never moved was never seen: a random code would be a wrong answer, a zero code is "unknown".
         codes = jnp.where(jnp.any(trained != features, axis=1, keepdims=True), codes, 0.0)
     return _Distillation(codes, losses)

@@ -183,8 +183,5 @@ def _nearest_miss(candidates: Sequence[Object]) -> str:
     if not best.conditions:
         return f"there is no other object to compare the {best.phrase!r} with"
     condition, score = min(best.conditions.items(), key=lambda item: item[1])
-    count = len(candidates)
-    names = {found.phrase for found in candidates}
-    what = repr(best.phrase) if len(names) == 1 else "objects"
-    kind = f"of {count} {what} none" if count > 1 else f"the {best.phrase!r} there is not"
-    return f"{kind} {condition}: the nearest scores {score:.2f}, and {SATISFIED:g} is needed"
+    what = repr(best.phrase) if len({found.phrase for found in candidates}) == 1 else "object"
+    return f"no {what} is {condition}: the nearest scores {score:.2f}, and {SATISFIED:g} is needed"
