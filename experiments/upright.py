@@ -255,9 +255,9 @@ def main(options: Options) -> dict:
         counts = np.zeros(3, int)
         for seed in range(options.seeds):
             points, up = scene(kind, seed)
-            found = find_up(points)
-            right = bool(found.up @ up > np.cos(np.radians(11)))
-            counts += right, right and found.sure, found.sure and not right
+            found, sure, _ = find_up(points)
+            right = bool(found @ up > np.cos(np.radians(11)))
+            counts += right, right and sure, sure and not right
         figures[kind] = dict(zip(("right", "right and sure", "wrong and sure"), counts.tolist()))
     rows = [(kind, options.seeds, *figures[kind].values()) for kind in KINDS]
     known = np.array([row[1:] for row in rows if row[0] not in UNKNOWABLE]).sum(0)

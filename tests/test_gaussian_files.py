@@ -84,12 +84,14 @@ SYSTEMS = "LDB RDB LUB RUB LDF RDF LUF RUF"
 @pytest.mark.parametrize(("number", "name"), [*enumerate(SYSTEMS.split(), 1)])
 @pytest.mark.parametrize("version", [3, 4])
 def test_a_spz_is_turned_from_the_axes_that_it_names(tmp_path, number, name, version):
-    """Left-handed ones too, in which the scene stands mirrored."""
     axes = np.array([1 if letter in "RDF" else -1 for letter in name])
     records = spz_record(0xADBE0002, bytes(12)) + spz_record(0xADBE0003, struct.pack("<I", number))
     (tmp_path / "a.spz").write_bytes(splat_files.spz(SCENE, version, axes=axes, records=records))
-    found = load_gaussians(tmp_path / "a.spz")
-    compare(found, SCENE, STEPS["four.spz"])
+    if axes.prod() < 0:
+        with refused("a.spz", "left-handed"):
+            load_gaussians(tmp_path / "a.spz")
+    else:
+        compare(load_gaussians(tmp_path / "a.spz"), SCENE, STEPS["four.spz"])
 
 
 def test_flat_gaussians_and_none(tmp_path):

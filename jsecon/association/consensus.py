@@ -535,7 +535,7 @@ def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse,
         weights[view.seen] += totals
         # Two Gaussians are together with the mean, over the layers of masks, of the product of their shares.
         layers = np.maximum(view.proposals.sum(0).max(initial=1.0), 1.0)
-        cast = _weights_on_masks(view)
+        cast = (view.votes @ sparse.csr_matrix(view.proposals.T)).tocoo()  # weight of each Gaussian on each proposal
         outside = np.maximum(1.0 - np.asarray(cast.sum(1)).ravel() / np.maximum(totals * layers, 1e-12), 0.0)
         share = cast.data / np.maximum(totals[cast.row] * layers, 1e-12)
         norm = np.bincount(cast.row, share**2, len(totals)) + outside**2 / layers
@@ -548,8 +548,3 @@ def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse,
         start += len(view.proposals)
     membership, visible = sum_entries(shares, (count, start)), sum_entries(looks, (count, len(views)))
     return membership, visible, (weights / max(len(views), 1)).astype(np.float32)
-
-
-def _weights_on_masks(view: FrameSuperpixels) -> Sparse:
-    """Returns the weight of each Gaussian on each proposal, a sparse matrix (n, M) of coordinates."""
-    return (view.votes @ sparse.csr_matrix(view.proposals.T)).tocoo()

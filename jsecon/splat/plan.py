@@ -222,16 +222,11 @@ def render_plan(
       ValueError: Shapes disagree.
     """
     require_shape("features", features, (plan.splats.shape[0], "D"), "Pass one row of features per Gaussian.")
-    _require_background(background, features.shape[1])
+    if background is not None:
+        got, remedy = np.shape(background), "Pass one number per channel of the features, or one for all."
+        require(got in ((), features.shape[1:]), "background", got, f"({features.shape[1]},)", remedy)
     traced = is_traced((plan, features, background))
     run = _composite_plan if traced else _composite_plan_compiled[plan.mesh is not None]
     if not traced and not depth and jax.default_backend() == "cpu":
         finite = finite or bool(np.isfinite(np.asarray(features)).all())
     return run(plan, features, background, depth, finite)
-
-
-def _require_background(background: Array | None, channels: int) -> None:
-    """Checks that a background is None, one number, or one number per channel."""
-    if background is not None:
-        got, remedy = np.shape(background), "Pass one number per channel of the features."
-        require(got in ((), (channels,)), "background", got, f"({channels},)", remedy)

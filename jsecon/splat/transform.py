@@ -50,28 +50,6 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
     )
 
 
-def transform_axes(gaussians: Gaussians, axes: Float[Array, "4 4"]) -> Gaussians:
-    """Transforms Gaussians between axes that may differ in handedness, by a similarity that may mirror.
-
-    A Gaussian equals its mirror image along its axes, so mirroring is a rotation.
-    """
-    matrix = np.asarray(axes, np.float64)
-    if np.linalg.det(matrix[:3, :3]) > 0:
-        return transform_gaussians(gaussians, matrix)
-    flip = np.array([-1.0, 1.0, 1.0])
-    directions = np.random.default_rng(0).normal(size=(8, 3))
-    bands = gaussians.sh.shape[1]
-    before, after = (np.asarray(sh_basis(jnp.asarray(d), bands), np.float64) for d in (directions, directions * flip))
-    signs = np.sign((before * after).sum(0))  # each basis function is even or odd in x
-    mirrored = dataclasses.replace(
-        gaussians,
-        means=gaussians.means * flip.astype(np.float32),
-        quaternions=gaussians.quaternions * np.array([1, 1, -1, -1], np.float32),
-        sh=gaussians.sh * signs.astype(np.float32)[:, None],
-    )
-    return transform_gaussians(mirrored, matrix @ np.diag([*flip, 1.0]))
-
-
 def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     """Measures what float32 would cost each float64 mean, in units of its Gaussian's largest standard deviation."""
     means = np.asarray(gaussians.means)

@@ -42,17 +42,6 @@ _SURE = 2.5
 much where there are fewer than _FEET things"""
 
 
-class _Upright(NamedTuple):
-    """The up axis of a scene."""
-
-    up: np.ndarray
-    """(3,) unit vector, world."""
-    sure: bool
-    """Whether it is trusted."""
-    evidence: str
-    """What it was taken from, in words."""
-
-
 class _Plane(NamedTuple):
     normal: np.ndarray
     offset: float
@@ -74,8 +63,10 @@ class _Candidate(NamedTuple):
     """whether the scene has a base in this direction"""
 
 
-def find_up(points: np.ndarray) -> _Upright:
+def find_up(points: np.ndarray) -> tuple[np.ndarray, bool, str]:
     """Finds the up axis of a scene from points (P, 3) of its surface.
+
+    Returns a unit vector (3,), whether it is trusted, and what it was taken from, in words.
 
     Where too little rests, as in a fitted room with floaters, it is the normal of a large plane with nearly all of the
     scene above it. Without such a plane it is the direction that fewest surfaces face, as walls do not; it is then not
@@ -104,15 +95,13 @@ def find_up(points: np.ndarray) -> _Upright:
     if best is None or (scores[order[0]] < 0.5 and margin < _SURE):
         ground = _ground_normal(points, planes, loose, tolerance)
         if ground is None:
-            return _Upright(
-                _along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene"
-            )
-        return _Upright(ground, False, "a plane with nearly all of the scene above it, and low things")
+            return _along_walls(points), False, "walls: fewest surfaces face it, as no plane carries the scene"
+        return ground, False, "a plane with nearly all of the scene above it, and low things"
     count = len(things)
     sure = count and best.share >= 0.5 and margin >= (_SURE if count >= _FEET else 2 * _SURE)
     evidence = f"{best.resting} of {count} thing{'s' * (count != 1)} that rest{'s' * (count == 1)} on what is below"
     evidence = evidence if count else "the base on which the scene is widest and lowest"
-    return _Upright(_exact(best.up, planes, points, tolerance), bool(sure), evidence)
+    return _exact(best.up, planes, points, tolerance), bool(sure), evidence
 
 
 def _exact(up: np.ndarray, planes: list[_Plane], points: np.ndarray, tolerance: float) -> np.ndarray:

@@ -33,7 +33,7 @@ from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
 from jsecon.read.splats.usd import save_usda
 from jsecon.splat.project import check_gaussians, unusable_rows
 from jsecon.splat.sh import C0
-from jsecon.splat.transform import float32_rounding, transform_axes
+from jsecon.splat.transform import float32_rounding, transform_gaussians
 from jsecon.types import Array, Gaussians
 
 _FORMATS = f"Gaussians or points as {', '.join(SCENES[:-1])} or {SCENES[-1]}"
@@ -95,7 +95,11 @@ def _read_spz(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
             records = body[16 + count * row :]
         else:
             records = data[32 : int.from_bytes(data[16:20], "little")]
-        gaussians = transform_axes(gaussians, _spz_axes(records if flags & 2 else b""))
+        axes = _spz_axes(records if flags & 2 else b"")
+        if np.linalg.det(axes) < 0:
+            problem = "it is stored in left-handed axes, in which the scene stands mirrored"
+            raise InputError(path, problem, remedy="Export it with right-handed axes, such as RUB.")
+        gaussians = transform_gaussians(gaussians, axes)
     gaussians = dataclasses.replace(gaussians, means=gaussians.means.astype(np.float32))
     return gaussians, _antialiasing_notes(path, bool(flags & 1))
 
