@@ -17,8 +17,8 @@ from jsecon.vision.protocols import Segmenter, Tracker
 
 def _encode(rows: Sparse) -> Sparse:
     """Encodes the runs of ones in rows (R, P): (R, P + 1) with 1 where a run begins, and -1 behind its end."""
-    pixels = rows.shape[1]
-    runs = (rows @ sparse.diags([1.0, -1.0], offsets=[0, 1], shape=(pixels, pixels + 1), dtype=np.float32)).tocsr()
+    size = rows.shape[1], rows.shape[1] + 1
+    runs = (rows @ (sparse.eye(*size, dtype=np.float32) - sparse.eye(*size, k=1, dtype=np.float32))).tocsr()
     runs.eliminate_zeros()
     runs.sort_indices()
     return runs

@@ -89,7 +89,8 @@ def _sorted_pairs(blocks: Array, owner: Array, depths: Array, number: int) -> tu
     """
     for_block, for_index = number.bit_length(), max((depths.shape[0] - 1).bit_length(), 1)
     if depths.dtype != jnp.float32 or for_block + 31 + for_index > 64:
-        blocks, _, owner = lax.sort((blocks, depths[owner], owner), num_keys=3, is_stable=False)
+        keys: Any = blocks, depths[owner], owner
+        blocks, _, owner = lax.sort(keys, num_keys=3, is_stable=False)
         return blocks, owner
     bits = lax.bitcast_convert_type(depths, jnp.uint32)[owner]
     with jax.enable_x64(True):
