@@ -169,7 +169,7 @@ def test_one_object_and_what_it_was_compared_with(scene):
 def test_an_open_question_is_asked_and_a_near_miss_is_named(scene):
     assert scene.relate("the red mug").question.startswith("which of 2 'red mug' is meant, from left")
     for text, reason in (
-        ("the orange ball on the dark blue box", "not on dark blue box"),
+        ("the orange ball on the dark blue box", "no 'orange ball' is on dark blue box"),
         ("the pink vase on the white plate", "'pink"),
         ("three red mugs", "the text says 3 and 2 match"),
     ):
