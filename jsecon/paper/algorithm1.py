@@ -18,7 +18,7 @@ from jsecon.vision.protocols import Segmenter, Tracker
 def _encode(rows: Sparse) -> Sparse:
     """Encodes the runs of ones in rows (R, P): (R, P + 1) with 1 where a run begins, and -1 behind its end."""
     size = rows.shape[1], rows.shape[1] + 1
-    runs = (rows @ (sparse.eye(*size, dtype=np.float32) - sparse.eye(*size, k=1, dtype=np.float32))).tocsr()
+    runs = (rows @ (sparse.eye(*size) - sparse.eye(*size, k=1))).tocsr()
     runs.eliminate_zeros()
     runs.sort_indices()
     return runs
