@@ -26,8 +26,8 @@ from jsecon.pipeline.new_frames import read_frames
 from jsecon.pipeline.options import is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.scene_files import read_scene
-from jsecon.query.render import hide
 from jsecon.read.captures.capture import load_capture, lone_photographs, taken_on
+from jsecon.splat.visible import hide
 from jsecon.types import Camera
 from jsecon.views.frame import field_up
 
