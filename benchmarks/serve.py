@@ -121,7 +121,7 @@ def odd(port: int, count: int) -> dict:
             connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     found = {f"{count} mutated": dict(statuses)}
     found["wrong token"] = request(port, "GET", "/healthz", token="wrong")[0]
-    paths = ("/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/mask.png?text=red&frame=../../x")
+    paths = ("/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/selection.ply?text=red&field=../../x")
     found["paths"] = [request(port, "GET", path)[0] for path in paths]
     with socket.create_connection(("127.0.0.1", port), timeout=60) as raw:
         lines = "POST /query HTTP/1.1", "Host: x", f"Authorization: Bearer {TOKEN}"

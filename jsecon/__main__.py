@@ -4,10 +4,11 @@ import errno
 import gc
 import io
 import os
+import signal
 import sys
 import traceback
 
-from jsecon.process import prepare_process, stop_by_signals
+from jsecon.process import prepare_process
 
 STOPPED = 130
 """exit code of a program that the user stopped"""
@@ -18,12 +19,10 @@ UNREAD = 141
 def main() -> int:
     """Runs the command line, and returns the exit code."""
     prepare_process()
-    if "--distributed" in sys.argv:
-        _keep_errors_for_python()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for letters that the terminal lacks
-    stop_by_signals()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, so that half-written files are removed
     code = 1
     try:
         from jsecon.app.cli import main as run
@@ -43,12 +42,6 @@ def main() -> int:
         os._exit(code)
     gc.freeze()  # else the interpreter collects three times at its end, for half a second
     return code
-
-
-def _keep_errors_for_python() -> None:
-    """Drops what C++ code prints: jax prints pages where another process of a run has ended."""
-    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def _describe_unwritten_output(error: OSError) -> int:

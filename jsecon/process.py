@@ -8,15 +8,12 @@ all cores and the speed of benchmarks/results.md does the same:
     import jsecon
 """
 
-import _thread
 import contextlib
 import ctypes
 import hashlib
 import os
 import re
-import signal
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Mapping
@@ -66,7 +63,7 @@ def _remove_damaged_programs(folder: Path) -> None:
     """From now on removes the files of a program in `folder` that jax warns of, without printing the warning.
 
     jax writes to a program's final name: a full disk, or a stop during the writing, leaves a part there. It would warn
-    of that forever, and never write the program again. `jsecon doctor` reports a disk without room for programs.
+    of that forever, and never write the program again.
     """
     show = warnings.showwarning
     warning = r"Error (?:reading|writing) persistent compilation cache entry for '([\w.-]+)'"
@@ -83,32 +80,6 @@ def _remove_damaged_programs(folder: Path) -> None:
     warnings.filterwarnings("always", warning)  # each time, also for programs of the same name
 
 
-def stop_by_signals() -> None:
-    """Makes SIGTERM raise KeyboardInterrupt, as Ctrl-C does, so that half-written files are removed.
-
-    One that Python drops, in a destructor or a callback of the garbage collector such as jax's, is raised again.
-    """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    show = sys.unraisablehook
-
-    def show_or_repeat(dropped: Any) -> None:
-        if dropped.exc_type is not KeyboardInterrupt:
-            return show(dropped)
-        again = threading.Timer(0.05, _stop_main)  # s; the destructor has ended by then
-        again.daemon = True
-        again.start()
-
-    sys.unraisablehook = show_or_repeat
-
-
-def _stop_main() -> None:
-    """Sends SIGTERM to the main thread; a shell's background jobs ignore SIGINT."""
-    if hasattr(signal, "pthread_kill"):  # it also ends a call that waits, such as a sleep
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
-    else:
-        _thread.interrupt_main(signal.SIGTERM)
-
-
 VIEWS_AT_ONCE = 8
 """largest number of views that are worked on side by side, as each holds its plan in memory"""
 
@@ -118,20 +89,21 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def available_memory() -> tuple[int | None, int | None]:
-    """Reads the free memory within this process's cgroup, and the cgroup's limit, in bytes; None if not stated."""
+def _available_memory() -> float:
+    """Reads the free memory, in bytes, within this process's cgroup of version 2; infinite where it is not stated."""
     try:
         found = re.search(r"MemAvailable: *(\d+) kB", Path("/proc/meminfo").read_text())
+        group = re.search(r"^0::/(.*)", Path("/proc/self/cgroup").read_text(), re.MULTILINE)
     except OSError:
-        return None, None
-    if found is None:
-        return None, None
-    free = int(found[1]) << 10
-    limit = _read_cgroup("memory.max", "memory/memory.limit_in_bytes")
-    if not limit or not limit[0].isdecimal() or int(limit[0]) >= 1 << 60:  # more is no limit
-        return free, None
-    used = _read_cgroup("memory.current", "memory/memory.usage_in_bytes") or ["0"]
-    return min(free, int(limit[0]) - int(used[0])), int(limit[0])
+        return float("inf")
+    free = float("inf") if found is None else int(found[1]) << 10
+    top = Path("/sys/fs/cgroup")
+    for folder in (top if group is None else top / group[1], top):  # a container has its own at the top
+        if (folder / "memory.max").is_file():
+            limit = (folder / "memory.max").read_text().strip()
+            used = int((folder / "memory.current").read_text())
+            return free if limit == "max" else min(free, int(limit) - used)
+    return free
 
 
 def peak_memory_mib() -> float:
@@ -151,24 +123,11 @@ def memory_budget() -> float:
     """
     text = os.environ.get(MEMORY)
     if text is None:
-        return float("inf") if (free := available_memory()[0]) is None else free / 2
+        return _available_memory() / 2
     try:
         return float(text) * 2**30
     except ValueError:
         raise InputError(MEMORY, repr(text), "GiB, a number", f"For example: export {MEMORY}=4") from None
-
-
-def _read_cgroup(new: str, old: str) -> list[str]:
-    """Words of a file of this process's cgroup, by its name in version 2 and its path in version 1; or none."""
-    try:
-        groups = dict(line.split(":", 2)[1:] for line in Path("/proc/self/cgroup").read_text().splitlines())
-    except (OSError, ValueError):
-        return []
-    kind, _, name = old.partition("/")
-    group = groups.get(kind, "/").lstrip("/")
-    top, at = Path("/sys/fs/cgroup"), groups.get("", "/").lstrip("/")
-    places = (top / at / new, top / new, top / kind / group / name, top / kind / name)
-    return next((path.read_text().split() for path in places if path.is_file()), [])
 
 
 def compilation_counts() -> dict[str, int]:

@@ -111,7 +111,7 @@ def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
     shapes = [jax.ShapeDtypeStruct(t.shape, t.dtype, weak_type=t.weak_type) for t in types]
     traced = export.export(function)(*shapes)
     data = bytes(traced.serialize())
-    with contextlib.suppress(InputError), atomic_write(file) as temporary:  # `jsecon doctor` reports a full disk
+    with contextlib.suppress(InputError), atomic_write(file) as temporary:  # a full disk
         temporary.write_bytes(_checksum(data) + data)
     return traced
 

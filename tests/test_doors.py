@@ -122,8 +122,7 @@ def test_every_door_names_the_word_that_it_does_not_understand(door, client, fin
             assert run_cli(*verb, "--out", tmp_path / "out.ply") == 2
             assert word in capsys.readouterr().err
         replies = [client.post("/query", json={"text": text}), client.get("/selection.ply", params={"text": text})]
-        replies.append(client.get("/mask.png", params={"text": text, "frame": "#0"}))
-        assert [(reply.status_code, word in reply.text) for reply in replies] == [(422, True)] * 3
+        assert [(reply.status_code, word in reply.text) for reply in replies] == [(422, True)] * 2
         (told,) = find(text)
         assert told.is_error
         assert word in told.content[0].text

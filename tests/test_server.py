@@ -2,8 +2,6 @@
 
 import socket
 
-import cv2
-import numpy as np
 import pytest
 
 pytest.importorskip("fastapi", reason="the extra serve is not installed")
@@ -39,9 +37,6 @@ def test_a_field_is_chosen_by_its_name_and_a_frame_by_its_place(client):
     assert named["field"] == "shelf"
     assert named["count"] == placed["count"] > 0
     assert [field["name"] for field in client.get("/healthz").json()["fields"]] == ["desk", "shelf"]
-    image = client.get("/mask.png", params={"text": "red", "frame": "#2"})
-    assert image.headers["x-frame"] == "frame_2"
-    assert cv2.imdecode(np.frombuffer(image.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (40, 48)
 
 
 @pytest.mark.parametrize(("status", "headers"), [
@@ -62,8 +57,8 @@ def test_a_page_of_another_site_cannot_ask(scenes, status, headers):
 
 def test_get_takes_what_it_lists_and_nothing_else(client):
     paths = client.get("/openapi.json").json()["paths"]
-    for path in ("/objects", "/selection.ply", "/mask.png"):
-        usual = {"text": "red", "field": "desk", "by": "votes", "frame": "#0"}
+    for path in ("/objects", "/selection.ply"):
+        usual = {"text": "red", "field": "desk", "by": "votes"}
         given = {parameter["name"]: usual[parameter["name"]] for parameter in paths[path]["get"]["parameters"]}
         found = client.get(path, params=given)
         assert found.status_code == 200 or "selects nothing" in found.text, found.text
@@ -111,10 +106,6 @@ def test_odd_questions_have_an_error_of_their_own_kind(client, status, body):
 def test_paths_lead_nowhere(client):
     for path in ("/../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/selection.ply/../../x", "//etc/passwd", "/query"):
         assert client.get(path).status_code in (404, 405, 422), path
-    for frame in ("../../etc/passwd", ""):
-        error = client.get("/mask.png", params={"text": "red", "frame": frame})
-        assert error.status_code == 422
-        assert error.json()["error"]
 
 
 def test_a_token_is_asked_for_where_one_is_set(scenes):

@@ -4,7 +4,6 @@ import collections
 import dataclasses
 import importlib
 import importlib.metadata
-import os
 import platform
 import re
 from pathlib import Path
@@ -13,10 +12,7 @@ from typing import Literal
 from jsecon.app import verbs
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
-from jsecon.process import available_memory, cores
 
-MIN_MEMORY = 2 << 30
-"""bytes that `jsecon demo` takes, rounded up"""
 REINSTALL = 'Run: pip install --force-reinstall "jsecon"'
 """remedy of a broken package"""
 
@@ -39,9 +35,7 @@ def _doctor(verb: verbs.Doctor, console: Console) -> verbs.VerbResult:
         return _describe_ledger(verb.field, console)
     with console.progress("checks"):
         checks = [_Check("python", "ok", f"{platform.python_version()}, {platform.platform(terse=True)}")]
-        checks += [_check_packages(), *_check_jax()]
-        checks.append(_Check("cores", "ok", f"{cores()} of {os.cpu_count()} may be used"))
-        checks += [_check_memory(), _check_programs(), *_check_extras()]
+        checks += [_check_packages(), *_check_jax(), *_check_extras()]
     console.print_line("\n".join(f"{check.status:<8} {check.name:<10} {check.message}" for check in checks))
     failed = [check for check in checks if check.remedy and check.status != "ok"]
     return {"checks": checks, "errors": [InputError(c.name, c.message, remedy=c.remedy) for c in failed]}
@@ -100,30 +94,7 @@ def _check_jax() -> list[_Check]:
         report = check_backend()
     except RuntimeError as error:
         return [jax_check, _Check("backend", "wrong", str(error), REMEDY)]
-    message = f"cosines are right to {report.cosine_error:.0e}"
-    if not report.matvec_error < 1e-3:
-        message += "; this jax has issue 39103, which jsecon avoids but your code may meet"
-    return [jax_check, _Check("backend", "ok", message)]
-
-
-def _check_memory() -> _Check:
-    """Measures the free memory."""
-    free, limit = available_memory()
-    if free is None:
-        return _Check("memory", "ok", "this system does not report the free memory")
-    message = f"{_size(free)} free" + ("" if limit is None else f", limit {_size(limit)} (cgroup)")
-    if free >= MIN_MEMORY:
-        return _Check("memory", "ok", message)
-    message += f"; jsecon demo takes {_size(MIN_MEMORY)}"
-    return _Check("memory", "wrong", message, "End other programs, or raise the limit.")
-
-
-def _check_programs() -> _Check:
-    """Counts the compiled programs that are kept."""
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    if folder is None:
-        return _Check("programs", "missing", "no folder can be written, so that every run compiles anew (set HOME)")
-    return _Check("programs", "ok", f"{sum(file.is_file() for file in Path(folder).rglob('*'))} files in {folder}")
+    return [jax_check, _Check("backend", "ok", f"cosines are right to {report.cosine_error:.0e}")]
 
 
 def _check_extras() -> list[_Check]:
@@ -142,8 +113,3 @@ def _check_extras() -> list[_Check]:
 def _package(need: str) -> str:
     """Returns the name in a requirement such as "numpy>=2"."""
     return re.split(r"[<>=!~; \[]", need)[0]
-
-
-def _size(count: int) -> str:
-    """Returns a number of bytes in GiB."""
-    return f"{count / 2**30:.1f} GiB"

@@ -1,7 +1,6 @@
 """`jsecon run` and `jsecon fit`, and what a run writes at its end: metrics.json, and report.html with pictures."""
 
 import contextlib
-import dataclasses
 import json
 from collections.abc import Sequence
 from functools import partial
@@ -98,8 +97,8 @@ def write_run(
     )
     warnings = [note for note in run.notes if note.startswith(WARNING)]
     with console.progress("report"):
-        result = report.section("Result", ". ".join([summary, *warnings]))
-        write_text(out / "report.html", report.page(title, lead, [result, *parts, _pictures(run), *_tables(run)]))
+        result = report.section("Result", ". ".join([summary, *run.notes]))
+        write_text(out / "report.html", report.page(title, lead, [result, *parts, _pictures(run)]))
     console.print_line("\n".join([*warnings, summary]))
     console.print_line(f"field   {out / 'field.safetensors'}\nreport  {out / 'report.html'}")
     return metrics
@@ -131,17 +130,3 @@ def _pictures(run: Run) -> str:
         ]
     words = "A region has one colour in all views, and so has each Gaussian by its strongest region; grey has none."
     return report.section("Frames, masks, regions", words, report.grid(cells, 4))
-
-
-def _tables(run: Run) -> list[str]:
-    """Returns the parts that show stages, notes and settings."""
-    seconds = {name: round(value, 1) for name, value in run.seconds.items()}
-    steps = [(step.name, step.status, seconds.get(step.name, ""), step.why) for step in run.steps]
-    options = [(f.name, getattr(run.options, f.name), f.default) for f in dataclasses.fields(run.options)]
-    changed = [(name, str(value)) for name, value, default in options if value != default]
-    words = "What ran, in seconds of wall time, also of an earlier run, and what this scene does not need."
-    return [
-        report.section("Stages", words, report.table(["stage", "", "s", "how, or why not"], steps)),
-        report.section("Notes", "", report.table(["note"], [[note] for note in run.notes])) if run.notes else "",
-        report.section("Settings", "", report.table(["changed", "value"], changed)),
-    ]

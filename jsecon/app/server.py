@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 from urllib.parse import urlsplit
 
-import cv2
-import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Query as Parameters, Request
 from fastapi.exceptions import RequestValidationError
@@ -41,7 +39,6 @@ from jsecon.app.scene import Scene, open_prepared
 from jsecon.change.history import events
 from jsecon.errors import InputError, describe_error
 from jsecon.pipeline.progress import Console
-from jsecon.query.pointing import frame_index
 
 MAX_BODY, MAX_FRAME = 64 * 1024, 32 * 1024 * 1024
 """bytes of a request's body, and of one with a photograph"""
@@ -80,10 +77,6 @@ class _Pair(_Request):
 class _Selection(_Request):
     text: Text
     by: verbs.By = "votes"
-
-
-class _MaskOf(_Selection):
-    frame: str | None = None
 
 
 class _NewFrame(_Request):
@@ -222,16 +215,6 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
         return ply_response(scene, scene.ask(request.text, by=request.by).mask)
-
-    @app.get("/mask.png", summary="The selection alone in a frame, alpha above 0.7")
-    def mask(request: Annotated[_MaskOf, Parameters()]) -> Response:
-        scene = find_scene(scenes, request.field)
-        answer = scene.ask(request.text, by=request.by)
-        best = [*scene.best_frames(answer, 1), 0][0]
-        index = best if request.frame is None else frame_index(scene.field, request.frame)
-        image = cv2.imencode(".png", scene.mask(answer, index).astype(np.uint8) * 255)[1].tobytes()
-        name = re.sub("[^ -~]", "?", scene.field.names[index])
-        return Response(image, media_type="image/png", headers={"x-frame": name})
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:

@@ -29,7 +29,7 @@ def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     """Does the work of `jsecon demo`: builds the field of the room, answers its texts, and measures the answers."""
     out = verb.out
     require_writable(out)
-    capture = _copy_capture(out)
+    capture = shutil.copytree(ROOM, out / "capture", dirs_exist_ok=True)
     holdout = json.loads((capture / "scene.json").read_text())["holdout"]
     options = Options(capture, holdout=holdout, steps=550)
     run = pipeline.run(options, out, console=console, on_scene=partial(running.show_scene, out, console))
@@ -51,24 +51,8 @@ def _demo(verb: verbs.Demo, console: Console) -> verbs.VerbResult:
     return {"written": [out / name for name in (*running.FILES, running.FIRST_VIEW, "queries")]} | metrics
 
 
-def _copy_capture(out: Path) -> Path:
-    """Copies the room to OUT/capture, whole or not at all, unless it is there."""
-    capture, unfinished = out / "capture", out / "capture.part"
-    if not capture.is_dir():
-        shutil.rmtree(unfinished, ignore_errors=True)
-        shutil.copytree(ROOM, unfinished)
-        unfinished.rename(capture)
-    return capture
-
-
 def _queries(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[LabelledFrame]) -> str:
     """Returns the part of the report with the best view of each answer beside the truth, and its figures."""
-    figures = {
-        "mIoU, text to Gaussians": f"{summary['miou']:.3f}",
-        "mAcc@0.25": f"{summary['macc']:.3f}",
-        "localisation accuracy": f"{summary['loc_acc']:.3f}",
-    }
-    table = report.table(tuple(figures), [tuple(figures.values())])
     frames = dict(zip(run.capture.names, np.asarray(run.capture.frames)))
     truth = {(frame.name, name): mask for frame in labels for name, (mask, _) in frame.objects.items()}
     cells = []
@@ -77,6 +61,7 @@ def _queries(run: Run, rows: list[Row], summary: dict[str, Any], labels: list[La
         overlay = pictures.selection_overlay(frames[row.frame], row.mask, truth[row.frame, text])
         words = f"IoU {row.iou:.2f}, {row.selected} Gaussians, region {row.region}, score {row.score:.2f}"
         cells.append(report.figure(overlay, words, strong=text))
-    words = "Pink: the selected Gaussians, rendered alone, over a held-out view. "
-    words += f"White line: the ground truth. Figures: {summary['protocol']}; a missing prediction counts as 0."
-    return report.section("Queries", words, table, report.grid(cells, 4))
+    words = f"mIoU {summary['miou']:.3f}, mAcc@0.25 {summary['macc']:.3f}, localisation accuracy "
+    words += f"{summary['loc_acc']:.3f} ({summary['protocol']}; a missing prediction counts as 0). "
+    words += "Pink: the selected Gaussians, rendered alone, over a held-out view. White line: the ground truth."
+    return report.section("Queries", words, report.grid(cells, 4))
