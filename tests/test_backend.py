@@ -15,9 +15,7 @@ pytestmark = pytest.mark.as_shipped
 
 
 def test_our_forms_are_right_here():
-    report = backend.check_backend()
-    assert report.platform == "cpu"
-    assert 0 < report.cosine_error < 1e-5
+    assert 0 < backend.check_backend() < 1e-5
 
 
 def test_wrong_cosines_raise(monkeypatch):

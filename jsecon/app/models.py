@@ -20,15 +20,13 @@ def _models(verb: verbs.Models, console: Console) -> verbs.VerbResult:
 def _list_models(console: Console) -> verbs.VerbResult:
     """Prints the catalogue: name, role, size, licence, whether it is on this machine, and what it is good for."""
     rows = []
-    columns = "{:<11} {:<10} {:>5} {:>7}  {:<5} {:<25} {}".format
-    console.print_line(columns("name", "role", "MB", "s/frame", "here", "licence", "adds"))
+    columns = "{:<11} {:<10} {:>5}  {:<5} {:<25} {}".format
+    console.print_line(columns("name", "role", "MB", "here", "licence", "adds"))
     for row in hub.catalogue():
         cached = row.cached_folder is not None
-        seconds = "-" if row.seconds is None else f"{row.seconds:.1f}"
         here = "yes" if cached else "-"
-        console.print_line(columns(row.name, row.role, row.megabytes, seconds, here, row.licence, row.purpose))
+        console.print_line(columns(row.name, row.role, row.megabytes, here, row.licence, row.purpose))
         rows.append(dataclasses.asdict(row) | {"cached": cached})
-    console.print_line("Seconds are of a frame of 400x300 on two cores, 40 regions or one object in it.")
     console.print_line("jsecon models get NAME fetches one; hub:owner/name is any other repository of huggingface.co.")
     return {"models": rows}
 

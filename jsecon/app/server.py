@@ -255,11 +255,9 @@ def ply_response(scene: Scene, mask: Bool[np.ndarray, " n"]) -> Response:
 
 
 def _describe(scene: Scene) -> dict[str, Any]:
-    """Plain values: name, numbers of Gaussians and regions, frames and their size."""
+    """Plain values: name, frames and their size."""
     field = scene.field
-    size = [field.cameras.width, field.cameras.height]
-    counts = {"gaussians": field.gaussians.count, "regions": field.regions.count}
-    return {"name": scene.name, **counts, "frames": list(field.names), "size": size}
+    return {"name": scene.name, "frames": list(field.names), "size": [field.cameras.width, field.cameras.height]}
 
 
 def _serve(verb: verbs.Serve, console: Console) -> verbs.VerbResult:

@@ -538,8 +538,8 @@ class Models(Verb):
 class Doctor(Verb):
     """Checks whether this machine has what runs need.
 
-    It prints a line each about the packages, jax and its devices, the backend's numbers, and each extra with the
-    command that installs it. The exit code is 2 if a check fails that every run depends on.
+    It prints a line each about Python, the packages, and jax with its devices and numbers. The exit code is 2 if a
+    check fails.
 
     Attributes:
       field: A field to describe instead: what its ledger holds of each kind, and how large that is.

@@ -74,9 +74,6 @@ class HubModel:
     """Licence of the weights."""
     purpose: str = ""
     """What it is good for, in one sentence."""
-    seconds: float | None = None
-    """Seconds of a frame on two cores of a Xeon with AVX-512: of a segmenter with 70 guided prompts, of an
-    embedder for 40 regions, of a tracker for one object. None if they were not measured."""
 
     @property
     def address(self) -> str:
