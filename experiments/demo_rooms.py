@@ -23,14 +23,13 @@ from experiments.rooms.panels import answers_overlay, side_by_side
 from experiments.tables.codes import encode, region_codes
 from jsecon import Scene
 from jsecon.app import evaluation, pictures
-from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
+from jsecon.evaluate.lerf import Row, evaluate_labels
 from jsecon.files import atomic_write
 from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import query_one_step
 from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.options import Options as RunOptions
 from jsecon.pipeline.progress import Console
-from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.read.masks.labels import load_lerf_labels
 from jsecon.types import Selection
 
@@ -87,8 +86,7 @@ def measure(folder: Path, seed: int, options: Options) -> tuple[dict[str, float]
     rows, summary = evaluation.evaluate(scene, labels, Console())
     _, exact = evaluation.evaluate(Scene(masked.field), labels, Console())
     select = one_step(run, scene.embedder)
-    alpha = {"alpha_thresholds": (ALPHA_THRESHOLD,)}
-    direct = evaluate_at_thresholds(run.field.gaussians, cameras, labels, select, **alpha)[ALPHA_THRESHOLD][1]
+    direct = evaluate_labels(run.field.gaussians, cameras, labels, select)[1]
     kinds = {"mIoU": summary, "exact outlines": exact, "one-step": direct}
     figures = {name: float(kind["miou"]) for name, kind in kinds.items()}
     return figures | {"PSNR, dB": float(np.mean(run.held_out.psnr))}, run, rows

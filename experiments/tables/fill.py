@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -14,10 +15,11 @@ from experiments.cells import append_cell, exclusive_lock, read_cells, run_helpe
 from experiments.datasets.benchmark import Benchmark
 from experiments.memory_maps import clear_programs
 from experiments.protocols.points import evaluate_points
+from experiments.protocols.rendered import VALA_THRESHOLD, by_masks
 from experiments.tables import twins
 from experiments.tables.answers import QUICK_STEPS, Answers, Method, Steps
 from experiments.tables.setting import Setting, prepare
-from jsecon.evaluate.lerf import ALPHA_THRESHOLD, VALA_THRESHOLD, evaluate_at_thresholds
+from jsecon.evaluate.lerf import ALPHA_THRESHOLD, evaluate_labels
 from jsecon.process import cores, peak_memory_mib
 
 DIGITS = 4
@@ -173,13 +175,13 @@ def measure(setting: Setting, answers: Answers) -> dict:
         )
         texts = {query: [round(iou, DIGITS)] for query, iou in ious.items()}
         return {name: figures[name] for name in KEPT if name in figures} | {"texts": texts}
-    both = evaluate_at_thresholds(
-        answers.gaussians or setting.evidence.gaussians,
-        setting.cameras,
-        bench.frames,
-        lambda query: answers.select(bench.queries.index(query)),
+    gaussians = answers.gaussians or setting.evidence.gaussians
+    select = functools.cache(lambda query: answers.select(bench.queries.index(query)))
+    (rows, strict), (beside, lenient) = (
+        evaluate_labels(gaussians, setting.cameras, bench.frames, select, alpha_threshold=threshold)
+        for threshold in (ALPHA_THRESHOLD, VALA_THRESHOLD)
     )
-    (rows, strict), (beside, lenient) = both[ALPHA_THRESHOLD], both[VALA_THRESHOLD]
+    strict |= by_masks(rows, bench.frames)
     texts = {
         query: [[round(r.iou, DIGITS) for r in of if r.query == query] for of in (rows, beside)]
         for query in dict.fromkeys(r.query for r in rows)

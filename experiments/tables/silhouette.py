@@ -15,12 +15,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float
 
+from experiments.protocols.rendered import VALA_THRESHOLD
 from jsecon.errors import require_shape
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.fit.resize import scale_cameras
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA
 from jsecon.process import cores
-from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD
+from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.scan import pixel_centres, to_tiles
 from jsecon.splat.visible import HIDDEN_LOGIT

@@ -9,11 +9,10 @@ from jsecon.app import verbs
 from jsecon.app.opening import locate_field
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
-from jsecon.evaluate.lerf import Row, evaluate_at_thresholds
+from jsecon.evaluate.lerf import Row, evaluate_labels
 from jsecon.files import write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
-from jsecon.query.render import ALPHA_THRESHOLD
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
 from jsecon.types import Selection
 
@@ -34,9 +33,7 @@ def evaluate(scene: Scene, labels: Sequence[LabelledFrame], console: Console) ->
     field = scene.field
     cameras = {name: field.cameras[t] for t, name in enumerate(field.names)}
     with console.progress("evaluate") as progress:
-        inputs = field.gaussians, cameras, labels, select
-        measured = evaluate_at_thresholds(*inputs, alpha_thresholds=(ALPHA_THRESHOLD,), progress=progress)
-    rows, summary = measured[ALPHA_THRESHOLD]
+        rows, summary = evaluate_labels(field.gaussians, cameras, labels, select, progress=progress)
     counts = f"{summary['pairs']} pairs of {summary['queries']} queries in {summary['frames']} frames"
     shares = {"mIoU": "miou", "mAcc@0.25": "macc", "localisation accuracy": "loc_acc"}
     figures = ", ".join(f"{name} {summary[key]:.3f}" for name, key in shares.items())

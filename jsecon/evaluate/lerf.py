@@ -2,12 +2,9 @@
 
 For every labelled frame and category, the Gaussians selected for the category (once per scene) are rendered alone at
 the size of the labels. The mask is alpha > 0.7, and its IoU with the labelled mask counts for the pair. mIoU and
-mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0. Localisation has three definitions:
-
-    loc_box    the paper's ("Evaluation metrics"): the centre of the mask's bounding box lies in a labelled box
-    loc_acc    the peak of the similarity, composited by sum alpha T s over the selected Gaussians alone and averaged
-               over a window of 4 % of the image height, lies in a labelled box, edges included
-    loc_mask   after the same smoothing of the mask, any of its largest pixels (LangSplat's rule for ties) lies in one
+mAcc@0.25 (strict) are over all pairs; a pair without prediction counts as 0. For the localisation accuracy the peak of
+the similarity, composited by sum alpha T s over the selected Gaussians alone and averaged over a window of 4 % of the
+image height, lies in a labelled box, edges included.
 """
 
 import dataclasses
@@ -21,7 +18,7 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, localization_accuracy, mean_iou
 from jsecon.fit.resize import resize_camera
-from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD, render_selection
+from jsecon.query.render import ALPHA_THRESHOLD, render_selection
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Gaussians, Progress, Selection
 
@@ -33,9 +30,7 @@ class Row:
     frame: str
     query: str
     iou: float
-    located: bool  # loc_acc
-    touched: bool  # loc_mask
-    centred: bool  # loc_box
+    located: bool
     point: tuple[int, int] | None  # x, y px of the peak of similarity
     selected: int  # number of Gaussians
     region: int  # that anchored the query, or -1
@@ -43,27 +38,27 @@ class Row:
     mask: np.ndarray = dataclasses.field(repr=False, compare=False)  # (H, W) bool, for pictures
 
 
-def evaluate_at_thresholds(
+def evaluate_labels(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
     labels: Sequence[LabelledFrame],
     select: Callable[[str], Selection | None],
     *,
-    alpha_thresholds: tuple[float, ...] = (ALPHA_THRESHOLD, VALA_THRESHOLD),
+    alpha_threshold: float = ALPHA_THRESHOLD,
     progress: Progress | None = None,
-) -> dict[float, tuple[list[Row], dict]]:
-    """Evaluates selections at several alpha thresholds, from one rendering per pair.
+) -> tuple[list[Row], dict]:
+    """Evaluates selections of labelled categories.
 
     Args:
       gaussians: Scene of N Gaussians.
       cameras: Camera of each frame by name, of any size with the aspect of the labels.
       labels: Labelled frames.
       select: Maps a category to a selection of Gaussians; None, no answer, counts as missing.
-      alpha_thresholds: Thresholds of the mask, by default those of OpenGaussian and VALA.
+      alpha_threshold: Threshold of the mask, by default OpenGaussian's.
       progress: Called with the number of pairs done and of all.
 
     Returns:
-      For each threshold the rows, one per labelled (frame, query) pair, and their summary.
+      The rows, one per labelled (frame, query) pair, and their summary.
     """
     for frame in labels:
         _check(frame, cameras)
@@ -71,17 +66,15 @@ def evaluate_at_thresholds(
     if not pairs:
         raise InputError("labels", "0 (frame, query) pairs", "at least one", "Give the folder of the label files.")
     answers: dict[str, Selection | None] = {}
-    rows: dict[float, list[Row]] = {threshold: [] for threshold in alpha_thresholds}
+    rows = []
     for done, (frame, category) in enumerate(pairs, start=1):
         if category not in answers:
             answers[category] = select(category)
         camera = resize_camera(cameras[frame.name], frame.width, frame.height)
-        results = _rows(gaussians, camera, frame, category, answers[category], alpha_thresholds)
-        for threshold, row in zip(alpha_thresholds, results):
-            rows[threshold].append(row)
+        rows.append(_row(gaussians, camera, frame, category, answers[category], alpha_threshold))
         if progress is not None:
             progress(done, len(pairs))
-    return {threshold: (pairs, _summary(pairs, threshold)) for threshold, pairs in rows.items()}
+    return rows, _summary(rows, alpha_threshold)
 
 
 def _summary(rows: Sequence[Row], alpha_threshold: float) -> dict:
@@ -96,41 +89,33 @@ def _summary(rows: Sequence[Row], alpha_threshold: float) -> dict:
         "miou": mean_iou(ious),
         "macc": accuracy_at(ious, 0.25),
         "acc_50": accuracy_at(ious, 0.5),
-        "loc_acc": float(np.mean([row.located for row in rows])) if rows else float("nan"),
-        "loc_mask": float(np.mean([row.touched for row in rows])) if rows else float("nan"),
-        "loc_box": float(np.mean([row.centred for row in rows])) if rows else float("nan"),
+        "loc_acc": float(np.mean([row.located for row in rows])),
     }
 
 
-def _rows(
+def _row(
     gaussians: Gaussians,
     camera: Camera,
     frame: LabelledFrame,
     category: str,
     selection: Selection | None,
-    thresholds: tuple[float, ...],
-) -> list[Row]:
+    alpha_threshold: float,
+) -> Row:
     true, boxes = frame.objects[category]
     count = 0 if selection is None else int(np.asarray(selection.mask).sum())
     region, score = (-1, 0.0) if selection is None else (int(selection.region), float(selection.score))
     if selection is None or not count:
-        empty = np.zeros(true.shape, bool)
-        return [Row(frame.name, category, 0.0, False, False, False, None, 0, region, score, empty) for _ in thresholds]
+        return Row(frame.name, category, 0.0, False, None, 0, region, score, np.zeros(true.shape, bool))
     camera = jax.tree.map(jnp.asarray, camera)
     rendering = render_selection(gaussians, camera, selection.mask, selection.similarity)
-    alpha, point = np.asarray(rendering.alpha), _middle(_peak(np.asarray(rendering.features[..., 0])))
-    rows = []
-    for threshold in thresholds:
-        mask = alpha > threshold
-        share = float(iou(mask, true)) if true.any() else 0.0
-        peaks = [(int(x), int(y)) for y, x in np.argwhere(_peak(mask))]
-        located, centred = (localization_accuracy([place], [boxes]) > 0 for place in (point, _box_centre(mask)))
-        touched = localization_accuracy(peaks, [boxes] * len(peaks)) > 0
-        rows.append(Row(frame.name, category, share, located, touched, centred, point, count, region, score, mask))
-    return rows
+    mask = np.asarray(rendering.alpha) > alpha_threshold
+    point = _middle(largest_pixels(np.asarray(rendering.features[..., 0])))
+    share = float(iou(mask, true)) if true.any() else 0.0
+    located = localization_accuracy([point], [boxes]) > 0
+    return Row(frame.name, category, share, located, point, count, region, score, mask)
 
 
-def _peak(image: np.ndarray) -> np.ndarray:
+def largest_pixels(image: np.ndarray) -> np.ndarray:
     """(H, W) bool the largest pixels of the smoothed image, if they are positive."""
     window = 2 * round(0.04 * image.shape[0] / 2) + 1  # side of a box filter, px: LangSplat's 30 of 730
     smooth = cv2.blur(image.astype(np.float64), (window, window), borderType=cv2.BORDER_REFLECT_101)
@@ -144,12 +129,6 @@ def _middle(where: np.ndarray) -> tuple[int, int] | None:
         return None
     middle = np.argmin((x - x.mean()) ** 2 + (y - y.mean()) ** 2)
     return int(x[middle]), int(y[middle])
-
-
-def _box_centre(mask: np.ndarray) -> tuple[int, int] | None:
-    """x, y of the centre of the bounding box of a mask; None for an empty mask."""
-    y, x = np.nonzero(mask)
-    return (int(x.min() + x.max()) // 2, int(y.min() + y.max()) // 2) if len(y) else None
 
 
 def _check(frame: LabelledFrame, cameras: Mapping[str, Camera]) -> None:

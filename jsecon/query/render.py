@@ -15,8 +15,6 @@ from jsecon.types import Array, Camera, Gaussians, Rendering
 
 ALPHA_THRESHOLD = 0.7
 """Alpha of OpenGaussian's silhouette (render_lerf_by_text.py)."""
-VALA_THRESHOLD = 10 / 255
-"""Alpha of VALA's silhouette: lenient, it rewards faint selections; reported beside 0.7."""
 
 
 def selection_mask(

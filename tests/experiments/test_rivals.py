@@ -18,7 +18,7 @@ from experiments.rivals.langsplat import train_langsplat
 from experiments.rivals.opengaussian import Schedule, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
 from jsecon import InputError, plan_view, project
-from jsecon.evaluate.lerf import ALPHA_THRESHOLD, evaluate_at_thresholds
+from jsecon.evaluate.lerf import evaluate_labels
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.vision.protocols import CANONICAL
 
@@ -46,8 +46,7 @@ def world():
 
 def miou(world, select):
     evidence, frames, views, *_ = world
-    both = evaluate_at_thresholds(evidence.gaussians, views, frames, lambda query: select(QUERIES.index(query)))
-    _, told = both[ALPHA_THRESHOLD]
+    _, told = evaluate_labels(evidence.gaussians, views, frames, lambda query: select(QUERIES.index(query)))
     assert told["pairs"] == sum(len(frame.objects) for frame in frames) >= 4
     return told["miou"]
 

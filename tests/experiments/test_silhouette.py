@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.protocols.rendered import VALA_THRESHOLD
 from experiments.tables.silhouette import SWEEPS, WEIGHTS, Footprints, ascend
-from jsecon.query.render import ALPHA_THRESHOLD, VALA_THRESHOLD
+from jsecon.query.render import ALPHA_THRESHOLD
 
 
 def made_up(seed, count=14, tiles=40, views=2):
