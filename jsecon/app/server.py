@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 from urllib.parse import urlsplit
 
+import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Query as Parameters, Request
 from fastapi.exceptions import RequestValidationError
