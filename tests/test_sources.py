@@ -6,10 +6,11 @@ import json
 import pytest
 
 from jsecon import InputError, load_field, save_field
+from jsecon.app.scene import Scene
 from jsecon.field.field import Provenance
 from jsecon.pipeline.model_loading import field_embedder
 from jsecon.pipeline.options import Options
-from jsecon.pipeline.sources import _relative_folders, locate_sources
+from jsecon.pipeline.sources import locate_sources, provenance
 
 CLIP = "clip-0123456789abcdef"
 
@@ -19,17 +20,19 @@ def told(field, **given):
 
 
 def test_hints_are_relative_to_the_field_and_are_followed_from_its_file(field, tmp_path):
-    out, model, scan = tmp_path / "runs" / "a", tmp_path / "models" / "clip", tmp_path / "scan.las"
+    out, model, scan = tmp_path / "runs" / "a", tmp_path / "models" / "clip", tmp_path / "scan.xyz"
     for folder in (out, model):
         folder.mkdir(parents=True)
     given = Options(tmp_path / "capture", embedder=model, points=scan)
     scan.touch()
-    hints = _relative_folders(given, out)
-    assert hints == {"points": "../../scan.las", "embedder": "../../models/clip"}
+    hints = json.loads(provenance(given, {}, out))["folders"]
+    assert hints == {"points": "../../scan.xyz", "embedder": "../../models/clip"}
     own = told(field, folders=hints)
     save_field(out / "field.safetensors", own)
     assert locate_sources(load_field(out / "field.safetensors")) == (model, None, scan)
     assert locate_sources(own) == (None, None, None)  # of a field that no file was read of
+    Scene(load_field(out / "field.safetensors")).save(tmp_path / "b" / "field.safetensors")
+    assert locate_sources(load_field(tmp_path / "b" / "field.safetensors")) == (model, None, scan)
 
 
 def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path):

@@ -37,7 +37,7 @@ from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, read_date
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.sources import forget_warnings, locate_sources, run_warnings
+from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints, run_warnings
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query, split_part
@@ -314,7 +314,7 @@ class Scene:
         """
         path = Path(path)
         ledger = None if self._read_ledger is None else self.ledger
-        save_with_ledger(path, self.field, ledger)
+        save_with_ledger(path, move_hints(self.field, path.parent), ledger)
 
     def _require_memory(self, what: str) -> None:
         """Raises InputError if the field is mapped, which `what` needs in memory."""

@@ -11,10 +11,11 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jsecon
 from jsecon.errors import InputError
+from jsecon.field.field import Provenance
 from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options, is_bare_scene
@@ -50,9 +51,26 @@ def provenance(options: Options, keys: dict[str, str], out: Path, warnings: Sequ
 
 def forget_warnings(field: LanguageField, names: Sequence[str]) -> LanguageField:
     """Leaves out what the run warned of some frames."""
-    origin = parse_json(field.provenance)
-    origin["warnings"] = [text for text in origin.get("warnings", []) if not any(name in text for name in names)]
-    return dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
+    warnings = parse_json(field.provenance).get("warnings", [])
+    kept = [text for text in warnings if not any(name in text for name in names)]
+    return _with_origin(field, getattr(field.provenance, "folder", None), warnings=kept)
+
+
+def move_hints(field: LanguageField, folder: Path) -> LanguageField:
+    """Makes the hints of a field, which are relative to its file, those of a file in another folder."""
+    before, folder = getattr(field.provenance, "folder", None), folder.resolve()
+    if before in (None, folder):
+        return field
+    found = {kind: _resolve(before, hint) for kind, hint in parse_json(field.provenance).get("folders", {}).items()}
+    hints = {kind: hint for kind, path in found.items() if path is not None and (hint := _hint(path, folder))}
+    return _with_origin(field, folder, folders=hints)
+
+
+def _with_origin(field: LanguageField, folder: Path | None, **changes: Any) -> LanguageField:
+    origin = Provenance(json.dumps(parse_json(field.provenance) | changes, sort_keys=True))
+    if folder is not None:
+        origin.folder = folder
+    return dataclasses.replace(field, provenance=origin)
 
 
 def run_warnings(field: LanguageField) -> list[str]:
@@ -72,12 +90,16 @@ def _given_points(options: Options) -> Path | None:
 
 def _relative_folders(options: Options, out: Path) -> dict[str, str]:
     """Folders of options, relative to the output folder."""
-    folders = {}
-    for name, folder in (("embedder", options.embedder), ("points", _given_points(options))):
-        if folder is not None and cached_address(Path(folder)) is None:
-            with contextlib.suppress(ValueError):  # another drive of Windows: the user must name the folder again
-                folders[name] = Path(os.path.relpath(os.path.realpath(folder), os.path.realpath(out))).as_posix()
-    return folders
+    given = {"embedder": options.embedder, "points": _given_points(options)}
+    paths = {name: Path(path) for name, path in given.items() if path is not None}
+    return {name: hint for name, path in paths.items() if cached_address(path) is None and (hint := _hint(path, out))}
+
+
+def _hint(path: Path, folder: Path) -> str:
+    """A path relative to a folder; empty on another drive of Windows, where the user must name it again."""
+    with contextlib.suppress(ValueError):
+        return Path(os.path.relpath(os.path.realpath(path), os.path.realpath(folder))).as_posix()
+    return ""
 
 
 def locate_sources(field: LanguageField) -> _Sources:
