@@ -262,7 +262,7 @@ class Autoencoder:
     """Parameters of one scene's autoencoder (`train_autoencoder`)."""
 
     encoder: Leaf
-    """{"params", "batch_stats"}: nested dicts of arrays by layer."""
+    """{"params", "batch_stats"}: nested dicts of arrays, flax's layout."""
     decoder: Leaf
     """{"params"}: nested dicts of arrays."""
 

@@ -5,17 +5,15 @@ bring the embeddings back, min |D(E(phi_bar)) - phi_bar|^2 + w (1 - cos(D(E(phi_
 """
 
 import functools
-import itertools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from jsecon.errors import require, require_shape
-from jsecon.numerics import FULL_PRECISION, cosine, normalize
+from jsecon.numerics import FULL_PRECISION, cosine, is_traced, normalize
 from jsecon.types import Array, Autoencoder, Key, Progress
 
 MIN_STEPS = 1_000
@@ -88,8 +86,8 @@ def train_autoencoder(
     batches = -(-count // 64)  # of similar sizes: batch normalisation cannot learn from one or two regions
     total = epochs if epochs is not None else max(100, -(-MIN_STEPS // batches))
     # LangSplat's hidden layers for E = 512; one narrower than the latent is widened to it.
-    inward = (dim, *(max(w, latent) for w in (256, 128, 64, 32)), latent)
-    outward = (latent, *(max(w, latent) for w in (16, 32, 64, 128, 256, 256)), dim)
+    inward = (*(max(w, latent) for w in (256, 128, 64, 32)), latent)
+    outward = (*(max(w, latent) for w in (16, 32, 64, 128, 256, 256)), dim)
     plan = _Plan(inward, outward, batches)
     init_key, shuffle_key = jax.random.split(key)
     carry = _start(units, init_key, plan)
@@ -101,7 +99,8 @@ def train_autoencoder(
             jax.block_until_ready(carry)
             progress(stop, total)
     _, vector, stats = carry[1]
-    params = jax.jit(ravel_pytree(_bounds(plan, units.dtype))[1])(vector)
+    vector = vector if is_traced(vector) else np.asarray(vector)  # NumPy's slices need no compilation
+    params = jax.device_put(_unflatten(vector, _shapes(units, plan)[0]))
     return Autoencoder({"params": params["encoder"], "batch_stats": stats}, {"params": params["decoder"]})
 
 
@@ -113,31 +112,42 @@ class _Plan(NamedTuple):
     batches: int
 
 
-def _bounds(plan: _Plan, dtype: Any) -> Any:
-    """Parameters {"encoder", "decoder"}, each the bound of the interval around 0 that it is drawn from."""
-    params: dict[str, dict[str, Any]] = {"encoder": {}, "decoder": {}}
-    for layers, widths in zip(params.values(), (plan.encoder_widths, plan.decoder_widths)):
-        for n, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
-            kernel = np.full((inputs, outputs), inputs**-0.5, dtype)  # PyTorch's default, which LangSplat starts from
-            layers[f"Dense_{n}"] = {"kernel": kernel, "bias": kernel[0]}
-    for n, width in enumerate(plan.encoder_widths[1:-1]):
-        params["encoder"][f"BatchNorm_{n}"] = {"scale": np.zeros(width, dtype), "bias": np.zeros(width, dtype)}
-    return params
-
-
 @functools.partial(jax.jit, static_argnames="plan")
 def _start(units: Array, key: Key, plan: _Plan) -> Any:
     """((parameters as one vector, batch statistics, Adam's moments), best so far: (loss, vector, batch statistics))."""
-    bounds, unflatten = ravel_pytree(_bounds(plan, units.dtype))
-    # One draw for all layers compiles several times faster than one a layer.
-    params = unflatten(bounds * jax.random.uniform(key, bounds.shape, units.dtype, -1.0, 1.0))
-    stats = {}
-    for n, width in enumerate(plan.encoder_widths[1:-1]):
-        ones = jnp.ones(width, units.dtype)
-        params["encoder"][f"BatchNorm_{n}"]["scale"] = ones
-        stats[f"BatchNorm_{n}"] = {"mean": jnp.zeros_like(ones), "var": ones}
-    vector, _ = ravel_pytree(params)
-    return (vector, stats, _optimizer().init(vector)), (jnp.asarray(jnp.inf, units.dtype), vector, stats)
+    shapes, stats = _shapes(units, plan)
+    middle, spread = [], []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
+        part, name, kind = (step.key for step in path)
+        norm = name.startswith("BatchNorm")
+        middle.append(np.full(leaf.size, float(norm and kind == "scale")))
+        # PyTorch's default, which LangSplat starts from: weights and biases uniform in +-1/sqrt(inputs).
+        spread.append(np.full(leaf.size, 0.0 if norm else shapes[part][name]["kernel"].shape[0] ** -0.5))
+    middle, spread = (jnp.asarray(np.concatenate(values), units.dtype) for values in (middle, spread))
+    # One draw for all layers compiles several times faster than flax's initialisers, a draw a layer.
+    vector = middle + spread * jax.random.uniform(key, middle.shape, units.dtype, -1.0, 1.0)
+    stats = {
+        name: {"mean": jnp.zeros_like(norm["mean"]), "var": jnp.ones_like(norm["var"])} for name, norm in stats.items()
+    }
+    moments = _optimizer().init(vector)
+    return (vector, stats, moments), (jnp.asarray(jnp.inf, units.dtype), vector, stats)
+
+
+def _shapes(units: Array, plan: _Plan) -> tuple[Any, Any]:
+    """Shapes of the parameters {"encoder", "decoder"} and of the batch statistics."""
+    key, codes = jax.random.key(0), jnp.zeros((1, plan.encoder_widths[-1]), units.dtype)
+    encoder, decoder = _layers()
+    first = jax.eval_shape(lambda: encoder(plan.encoder_widths).init(key, units[:1], train=False))
+    second = jax.eval_shape(lambda: decoder(plan.decoder_widths).init(key, codes))
+    return {"encoder": first["params"], "decoder": second["params"]}, first["batch_stats"]
+
+
+def _unflatten(vector: Any, shapes: Any) -> Any:
+    """The tree of parameters that `vector` holds end to end."""
+    leaves, tree = jax.tree.flatten(shapes)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = [vector[end - leaf.size : end].reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+    return jax.tree.unflatten(tree, parts)
 
 
 def _optimizer() -> Any:
@@ -153,17 +163,19 @@ def _epochs(
 ) -> Any:
     count = units.shape[0]
     size = -(-count // plan.batches)
+    encoder, decoder = (layers(widths) for layers, widths in zip(_layers(), (plan.encoder_widths, plan.decoder_widths)))
     optimizer = _optimizer()
-    _, unflatten = ravel_pytree(_bounds(plan, units.dtype))
+    shapes, _ = _shapes(units, plan)
 
     def difference(params, codes, x, weight):
-        out = _run_decoder(params["decoder"], codes)
+        out: Any = decoder.apply({"params": params["decoder"]}, codes)
         return jnp.mean((out - x) ** 2) + weight * (1 - jnp.mean(cosine(out, x)))
 
     def loss(vector, stats, x):
-        params = unflatten(vector)
-        codes, stats = _run_encoder(params["encoder"], stats, x, train=True)
-        return difference(params, codes, x, 0.001), stats
+        params = _unflatten(vector, shapes)
+        variables = {"params": params["encoder"], "batch_stats": stats}
+        codes, changed = encoder.apply(variables, x, train=True, mutable=["batch_stats"])
+        return difference(params, codes, x, 0.001), changed["batch_stats"]
 
     def step(state, x) -> tuple[Any, None]:
         vector, stats, moments = state
@@ -179,8 +191,8 @@ def _epochs(
 
         def judge(best):
             vector, stats, _ = state
-            params = unflatten(vector)
-            codes, _ = _run_encoder(params["encoder"], stats, units, train=False)
+            params = _unflatten(vector, shapes)
+            codes = encoder.apply({"params": params["encoder"], "batch_stats": stats}, units, train=False)
             # LangSplat trains with the cosine term at 0.001 and chooses its checkpoint with it at full weight.
             value = difference(params, codes, units, 1.0)
             return jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, vector, stats), best)
@@ -190,36 +202,46 @@ def _epochs(
     return jax.lax.fori_loop(start, stop, epoch, carry)
 
 
+def _widths(params: Any) -> tuple[int, ...]:
+    layers = sum(name.startswith("Dense_") for name in params)
+    return tuple(params[f"Dense_{i}"]["kernel"].shape[-1] for i in range(layers))
+
+
 @jax.jit
 def _encode(variables: Any, rows: Array) -> Array:
-    codes, _ = _run_encoder(variables["params"], variables["batch_stats"], rows, train=False)
+    codes: Any = _layers()[0](_widths(variables["params"])).apply(variables, rows, train=False)
     return jnp.where(jnp.any(rows != 0, axis=-1, keepdims=True), codes, 0.0)
 
 
 @jax.jit
-def _decode(variables: Any, rows: Array) -> Array:
-    return _run_decoder(variables["params"], rows)
+def _decode(variables: Any, rows: Array) -> Any:
+    return _layers()[1](_widths(variables["params"])).apply(variables, rows)
 
 
-def _run_encoder(params: Any, stats: Any, x: Array, *, train: bool) -> tuple[Array, Any]:
-    """Returns the codes of rows, normalised by their own statistics to `train`, and the statistics after that."""
-    x, updated = _dense(params["Dense_0"], x), {}
-    for n in range(len(stats)):
-        name = f"BatchNorm_{n}"
-        norm, known = params[name], stats[name]
-        used = {"mean": x.mean(axis=0), "var": x.var(axis=0)} if train else known
-        updated[name] = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, known, used)
-        x = (x - used["mean"]) * jax.lax.rsqrt(used["var"] + 1e-5) * norm["scale"] + norm["bias"]
-        x = _dense(params[f"Dense_{n + 1}"], jax.nn.relu(x))
-    return normalize(x), updated
+@functools.cache
+def _layers() -> tuple[Any, Any]:
+    """Encoder and decoder, by their widths. flax is imported here, late: a field is read without it."""
+    from flax import linen as nn
 
+    class Encoder(nn.Module):
+        widths: tuple[int, ...]
 
-def _run_decoder(params: Any, x: Array) -> Array:
-    """Returns the embeddings of codes."""
-    for n in range(len(params)):
-        x = _dense(params[f"Dense_{n}"], jax.nn.relu(x) if n else x)
-    return normalize(x)
+        @nn.compact
+        def __call__(self, x, train: bool):
+            x = nn.Dense(self.widths[0], param_dtype=x.dtype, precision=FULL_PRECISION)(x)
+            for width in self.widths[1:]:
+                norm = nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5, param_dtype=x.dtype)
+                x = nn.relu(norm(x))
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(x)
+            return normalize(x)
 
+    class Decoder(nn.Module):
+        widths: tuple[int, ...]
 
-def _dense(layer: Any, x: Array) -> Array:
-    return jnp.matmul(x, layer["kernel"], precision=FULL_PRECISION) + layer["bias"]
+        @nn.compact
+        def __call__(self, x):
+            for index, width in enumerate(self.widths):
+                x = nn.Dense(width, param_dtype=x.dtype, precision=FULL_PRECISION)(nn.relu(x) if index else x)
+            return normalize(x)
+
+    return Encoder, Decoder
