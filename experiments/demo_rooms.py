@@ -23,6 +23,7 @@ from experiments.rooms.panels import answers_overlay, side_by_side
 from experiments.tables.codes import encode, region_codes
 from jsecon import Scene
 from jsecon.app import evaluation, pictures
+from jsecon.app.catalogue import main_regions, palette
 from jsecon.evaluate.lerf import Row, evaluate_labels
 from jsecon.files import atomic_write
 from jsecon.paper.distill import distill_votes
@@ -103,7 +104,7 @@ def draw(run: pipeline.Run, rows: list[Row], out: Path) -> None:
     nearest = int(np.abs(train - frame).argmin())
     frames, t = np.asarray(run.capture.frames), int(train[nearest])
     masks = {row.query: row.mask for row in rows if row.frame == pictured}
-    colours = pictures.region_colours(run.field)
+    colours = np.concatenate([palette(run.field.regions.count) / 255, np.full((1, 3), 0.25)])[main_regions(run.field)]
     panels = {
         "frame": frames[frame],
         "masks of one object each": pictures.label_overlay(frames[t], run.labels[nearest]),

@@ -16,6 +16,9 @@ class InputError(ValueError):
       problem: What is wrong there: a clause without a full stop, or what is there in place of `expected`.
       expected: What should be there.
       remedy: What to do about it, a sentence.
+
+    Attributes:
+      sentence: The problem as a sentence, without the place and the remedy.
     """
 
     def __init__(self, where: object, problem: str, expected: str = "", remedy: str = ""):
@@ -23,12 +26,8 @@ class InputError(ValueError):
         self.where, self.problem = texts
         self.expected = expected
         self.remedy = remedy
+        self.sentence = f"{self.problem.rstrip('.')}{f', expected {expected}' if expected else ''}."
         super().__init__(f"{self.where}: {self.sentence} {remedy}".removeprefix(": ").rstrip())
-
-    @property
-    def sentence(self) -> str:
-        """The problem as a sentence, without the place and the remedy."""
-        return f"{self.problem.rstrip('.')}{f', expected {self.expected}' if self.expected else ''}."
 
 
 _MACHINE = {

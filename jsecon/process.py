@@ -24,7 +24,6 @@ from jsecon.errors import InputError
 
 MEMORY = "JSECON_MEMORY"
 """environment variable: GiB for a scene's columns, in place of half of the free memory"""
-_counts: dict[str, int] = {}
 
 
 def prepare_process(*, keep_programs: bool = True) -> None:
@@ -128,23 +127,6 @@ def memory_budget() -> float:
         return float(text) * 2**30
     except ValueError:
         raise InputError(MEMORY, repr(text), "GiB, a number", f"For example: export {MEMORY}=4") from None
-
-
-def compilation_counts() -> dict[str, int]:
-    """Counts the programs that jax has compiled since the first call ("all"), and of these those "from_disk"."""
-    import jax
-
-    if not _counts:
-        _counts.update(all=0, from_disk=0)
-
-        def count(event: str, *_: object, **__: object) -> None:
-            name = {"backend_compile_duration": "all", "cache_hits": "from_disk"}.get(event.rpartition("/")[2])
-            if name is not None:
-                _counts[name] += 1
-
-        jax.monitoring.register_event_listener(count)
-        jax.monitoring.register_event_duration_secs_listener(count)
-    return dict(_counts)
 
 
 def _settings(environ: Mapping[str, str], cores: int, cpu_features: frozenset[str]) -> dict[str, str]:

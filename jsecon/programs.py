@@ -87,20 +87,6 @@ def stored_jit(
     return call
 
 
-def numpy_outside_traces(function: Callable) -> Callable:
-    """Gives a function of a tuple of arrays and of rules NumPy's arrays outside of a trace: it compiles no program."""
-    compiled = jax.jit(lambda arrays, rules: function(*arrays, rules))
-
-    @functools.wraps(function)
-    def call(arrays: tuple, rules: Any) -> Any:
-        if is_traced((arrays, rules)):
-            return compiled(arrays, rules)
-        with np.errstate(invalid="ignore"):
-            return function(*jax.tree.map(np.asarray, arrays), rules)
-
-    return call
-
-
 def _stored(file: Path, function: Any, types: list[Any]) -> export.Exported:
     """Reads the trace of a function for arguments of some types, or makes and writes it."""
     with contextlib.suppress(OSError):

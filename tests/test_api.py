@@ -55,7 +55,7 @@ def jsecon_imports(path: Path) -> set[str]:
 GROUND = ("types", "numerics", "errors", "files", "parallel", "process", "programs", "backend")
 LAYERS = (
     "splat", "vision", "read", "fit", "poses", "networks", "field", "association", "paper", "query", "evaluate",
-    "views", "change", "pipeline", "app", "demo",
+    "views", "change", "pipeline", "app",
 )  # fmt: skip
 """packages, lowest first: each imports the modules of the root, itself, and packages before it"""
 

@@ -16,8 +16,7 @@ from test_mcp import call
 from jsecon import At, Box, InputError, Mask, Region, Scene, load_gaussians, open_scene, save_field
 from jsecon.app.evaluation import evaluate
 from jsecon.app.mcp_server import make_server
-from jsecon.app.server import application
-from jsecon.app.viewer.served import page_application
+from jsecon.app.server import application, page_application
 from jsecon.pipeline.progress import Console
 from jsecon.read.masks.labels import LabelledFrame
 

@@ -40,8 +40,7 @@ def page():
     figures = report.grid([report.figure(_image(), "<b>x</b>", strong="<i>mug</i>", sharp=True)], 2)
     view = report.grid([report.figure(_image(), "view")], 3)
     cards = report.grid(report.card(_image(), name, "words", view) for name in ("red <mug>", "blue mug"))
-    table = report.table(["a", "<b>fit</b>"], [[1, "<script>"]])
-    return report.page("A <title> & more", "lead", [report.section("Frames", "words", figures), cards, table])
+    return report.page("A <title> & more", "lead", [report.section("<b>fit</b>", "<script>", figures), cards])
 
 
 def picture(page, kind):

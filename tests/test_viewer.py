@@ -23,8 +23,7 @@ from jsecon.app import verbs
 from jsecon.app.catalogue import main_regions
 from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
-from jsecon.app.server import listen
-from jsecon.app.viewer.served import page_application
+from jsecon.app.server import listen, page_application
 from jsecon.app.viewer.view import _view
 from jsecon.change.history import move_object
 from jsecon.pipeline.progress import Console
@@ -104,8 +103,7 @@ def test_a_taken_port_and_a_missing_extra_are_refused(asked, tmp_path, monkeypat
     save_field(tmp_path / "field.safetensors", asked.field)
     with listen("127.0.0.1", 0)[0] as taken, refused("--port"):
         _view(verbs.View(field=tmp_path, texts=[], port=taken.getsockname()[1]), Console())
-    for module in ("jsecon.app.viewer.served", "jsecon.app.server"):
-        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.delitem(sys.modules, "jsecon.app.server")
     monkeypatch.setitem(sys.modules, "fastapi", None)
     with refused("fastapi is missing"):
         _view(verbs.View(field=tmp_path, texts=[], port=0), Console())

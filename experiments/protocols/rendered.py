@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from jsecon import localization_accuracy
-from jsecon.evaluate.lerf import Row, largest_pixels
+from jsecon.evaluate.lerf import Row
 from jsecon.read.masks.labels import LabelledFrame
 
 VALA_THRESHOLD = 10 / 255
@@ -22,10 +23,17 @@ def by_masks(rows: Sequence[Row], labels: Sequence[LabelledFrame]) -> dict[str, 
     touched, centred = [], []
     for row in rows:
         own = boxes[row.frame, row.query]
-        peaks = [(int(x), int(y)) for y, x in np.argwhere(largest_pixels(row.mask))]
+        peaks = [(int(x), int(y)) for y, x in np.argwhere(_largest_pixels(row.mask))]
         touched.append(localization_accuracy(peaks, [own] * len(peaks)) > 0)
         centred.append(localization_accuracy([_box_centre(row.mask)], [own]) > 0)
     return {"loc_mask": float(np.mean(touched)), "loc_box": float(np.mean(centred))}
+
+
+def _largest_pixels(mask: np.ndarray) -> np.ndarray:
+    """(H, W) bool the largest pixels of the smoothed mask, if it has any."""
+    window = 2 * round(0.04 * mask.shape[0] / 2) + 1  # px, as jsecon.evaluate.lerf smooths similarities
+    smooth = cv2.blur(mask.astype(np.float64), (window, window), borderType=cv2.BORDER_REFLECT_101)
+    return (smooth >= smooth.max() * (1 - 1e-6)) & mask.any()
 
 
 def _box_centre(mask: np.ndarray) -> tuple[int, int] | None:

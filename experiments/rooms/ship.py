@@ -15,7 +15,7 @@ from PIL import Image
 from experiments.rooms.capture import write_room
 from experiments.rooms.room import crowded_room
 from experiments.rooms.writers import write_colmap
-from jsecon.demo.demo import ROOM
+from jsecon.app.running import ROOM
 from jsecon.read.captures.capture import load_capture
 
 MAX_BYTES = 1_500_000

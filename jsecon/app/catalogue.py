@@ -58,6 +58,8 @@ class Catalogue:
 
     names: np.ndarray
     """(K,) str: the most probable name of the vocabulary."""
+    class_ids: np.ndarray
+    """(K,) int32 number of each object's name among all names, sorted."""
     probability: np.ndarray
     """(K,) its probability if exactly one of the vocabulary is right; 0 of a name that a query finds absent."""
     surroundings: np.ndarray
@@ -88,11 +90,6 @@ class Catalogue:
     def __len__(self) -> int:
         """K."""
         return len(self.parent)
-
-    @functools.cached_property
-    def class_ids(self) -> Int[np.ndarray, " k"]:
-        """(K,) number of each object's name among all names, sorted."""
-        return np.unique(self.names.astype(str), return_inverse=True)[1].astype(np.int32)
 
     def mask(self, index: int | np.integer) -> Bool[np.ndarray, " n"]:
         """Selects the Gaussians of an object.
@@ -207,6 +204,7 @@ def objects(
     source_axis = np.array(source_up(field, axis).axis)
     return Catalogue(
         names=text[best[rows]],
+        class_ids=np.unique(text[best[rows]].astype(str), return_inverse=True)[1].astype(np.int32),
         probability=probability[rows],
         surroundings=surroundings[rows],
         sure=sure[rows],

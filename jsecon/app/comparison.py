@@ -11,20 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
-from jsecon.change.detect import Change, object_changes
+from jsecon.change.detect import Change
 from jsecon.change.history import add_objects, dates, move_object, remove_object
 from jsecon.errors import InputError
 from jsecon.field.evidence import ViewEvidence, pack_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
-from jsecon.fit.resize import resize_camera, resize_capture, resize_frame, resize_mask, shrink_cameras
-from jsecon.read.captures.frames import evenly_spaced, move_capture
+from jsecon.fit.resize import resize_camera, resize_frame, resize_mask, shrink_cameras
+from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.splat.points import back_project, gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, LanguageField
 from jsecon.views.capture import render_capture
-from jsecon.views.frame import field_up
 from jsecon.vision.protocols import Embedder
 
 LONG_SIDE = 320
@@ -71,18 +70,6 @@ class Changes:
             "turned_degrees": round(np.degrees(Rotation.from_matrix(change.motion[:3, :3]).magnitude()), 1),
             "frames": [self.capture.names[t] for t in change.frames[:5]],
         }
-
-
-def find_changes(field: LanguageField, listed: Catalogue, capture: Capture) -> Changes:
-    """Compares a field with a capture whose poses are in the world of the field's own capture."""
-    capture = move_capture(capture, field.source_from_scene)
-    capture = resize_capture(capture, shrink_cameras(capture.cameras, LONG_SIDE))
-    things = np.append(~listed.surroundings, False)
-    labels = np.where(things[listed.labels], listed.labels, -1)
-    up = np.array(field_up(field).axis)
-    frames, depths = np.asarray(capture.frames), None if capture.depths is None else np.asarray(capture.depths)
-    found = object_changes(field.gaussians, labels, frames, capture.cameras, depths, up=up)
-    return Changes(field, listed, capture, tuple(found))
 
 
 def apply_changes(

@@ -185,7 +185,7 @@ def _page(changes: Changes) -> str:
     for change, record in zip(changes.found, changes.records()):
         if change.kind not in _COLOURS or not change.frames:
             kind = change.kind + (f" ({change.suspected}?)" if change.suspected else "")
-            others.append((record["name"], record["id"], kind, record["probability"]))
+            others.append(f"{record['name'] or 'something'} {kind}")
             continue
         t = max(change.frames, key=lambda t: int(change.before[t].sum() + change.after[t].sum()))
         images = pictures.render_picture(changes.field.gaussians, capture.cameras[t]), np.asarray(capture.frames[t])
@@ -196,9 +196,12 @@ def _page(changes: Changes) -> str:
         title, _, words = " ".join(_words(record).split()).partition(": ")
         cards.append(report.section(title, words, report.grid(pair, 2)))
     plan = report.figure(_draw_plan(changes), "From above: blue moved, red gone, green new, brown another look.")
-    table = report.table(("object", "id", "", "probability"), others)
     lead = f"{len(cards)} changes, {len(others)} other objects, by {len(capture.names)} photographs."
-    parts = [report.section("Plan", "", report.grid([plan], 2)), *cards, report.section("Other objects", "", table)]
+    parts = [
+        report.section("Plan", "", report.grid([plan], 2)),
+        *cards,
+        report.section("Other objects", ", ".join(others)),
+    ]
     return report.page("Changes", lead, parts)
 
 

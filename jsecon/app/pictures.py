@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jsecon.app.catalogue import main_regions, palette
+from jsecon.app.catalogue import palette
 from jsecon.field.columns import is_mapped
 from jsecon.field.evidence import MAX_WHOLE
 from jsecon.splat.render import render, render_rgb
 from jsecon.splat.visible import render_in_blocks
-from jsecon.types import Camera, Gaussians, LanguageField
+from jsecon.types import Camera, Gaussians
 
 SELECTED = (255, 64, 160)
 """RGB of a selection, which no natural object has"""
@@ -44,11 +44,6 @@ def outlined(image: np.ndarray, mask: np.ndarray, colour: tuple[int, ...], thick
     image = np.ascontiguousarray(image)
     cv2.drawContours(image, contours, -1, colour, thickness)
     return image
-
-
-def region_colours(field: LanguageField) -> Float[np.ndarray, "n 3"]:
-    """Returns the colour of each Gaussian's main region in [0, 1]; grey without a region."""
-    return np.concatenate([palette(field.regions.count) / 255, np.full((1, 3), 0.25)])[main_regions(field)]
 
 
 def render_picture(

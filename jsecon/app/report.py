@@ -6,7 +6,7 @@ without the script only the enlarged pictures are missing. Each function returns
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib import resources
 
 import cv2
@@ -24,18 +24,6 @@ def section(title: str, words: str, *parts: str) -> str:
     """Makes a section; `words` stand under its heading."""
     paragraph = f'<p class="soft">{_escaped(words)}</p>' if words else ""
     return f"<section><h2>{_escaped(title)}</h2>{paragraph}{''.join(parts)}</section>"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Makes a table, which scrolls sideways on a narrow screen; numbers stand on the right."""
-
-    def cells(tag: str, row: Sequence[object]) -> str:
-        kinds = (" class=n" if isinstance(cell, int | float) else "" for cell in row)
-        return "".join(f"<{tag}{kind}>{_escaped(cell)}</{tag}>" for kind, cell in zip(kinds, row))
-
-    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    head = f"<thead><tr>{cells('th', header)}</tr></thead>"
-    return f'<div class="scroll"><table>{head}<tbody>{body}</tbody></table></div>'
 
 
 def figure(image: np.ndarray, caption: str, *, strong: str = "", sharp: bool = False) -> str:

@@ -20,10 +20,11 @@ from jaxtyping import Bool, UInt8
 
 from jsecon.app import pictures
 from jsecon.app.catalogue import Catalogue, objects
-from jsecon.app.comparison import Changes, apply_changes, find_changes, new_things, splat_capture
+from jsecon.app.comparison import LONG_SIDE, Changes, apply_changes, new_things, splat_capture
 from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
+from jsecon.change.detect import object_changes
 from jsecon.change.history import add_unseen, change_question, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
@@ -33,6 +34,7 @@ from jsecon.field.ledger_file import load_ledger, save_with_ledger
 from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.field.tree import PARTS, cut_field
 from jsecon.files import FIELD_FILE, parse_json
+from jsecon.fit.resize import resize_capture, shrink_cameras
 from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, read_date
@@ -47,7 +49,7 @@ from jsecon.query.parts import match_lone_parts
 from jsecon.query.pointing import box_mask, frame_index, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
-from jsecon.read.captures.frames import take_frames
+from jsecon.read.captures.frames import move_capture, take_frames
 from jsecon.read.splats.files import save_gaussians
 from jsecon.read.splats.points import load_point_cloud, save_point_cloud
 from jsecon.splat.points import nearest_gaussians
@@ -270,7 +272,7 @@ class Scene:
         if capture.depths is None or not capture.depths.any():
             return self.field, {}
         shown = take_frames(capture, np.flatnonzero(capture.depths.any(axis=(1, 2))).tolist())
-        things, masks = new_things(find_changes(self.field, self._catalogue, shown), capture.cameras)
+        things, masks = new_things(self._compare(shown), capture.cameras)
         field = add_unseen(self.field, things) if things else self.field
         return field, {shown.names[t]: mask for t, mask in masks.items()}
 
@@ -610,7 +612,19 @@ class Scene:
             self._require_memory("a comparison")
             if isinstance(later, Scene):
                 later = splat_capture(self.field, later.field.gaussians, np.asarray(later.field.source_from_scene))
-            return find_changes(self.field, self._catalogue, later)
+            return self._compare(later)
+
+    def _compare(self, capture: Capture) -> Changes:
+        """Compares the objects with a capture whose poses are in the world of the field's own capture."""
+        field, listed = self.field, self._catalogue
+        capture = move_capture(capture, field.source_from_scene)
+        capture = resize_capture(capture, shrink_cameras(capture.cameras, LONG_SIDE))
+        things = np.append(~listed.surroundings, False)
+        labels = np.where(things[listed.labels], listed.labels, -1)
+        up = np.array(field_up(field).axis)
+        frames, depths = np.asarray(capture.frames), None if capture.depths is None else np.asarray(capture.depths)
+        found = object_changes(field.gaussians, labels, frames, capture.cameras, depths, up=up)
+        return Changes(field, listed, capture, tuple(found))
 
     def update(self, changes: Capture | Changes, *, date: str) -> "Scene":
         """Applies what changed: objects move or are gone, and new ones come. Ids of regions stay.

@@ -1,4 +1,4 @@
-"""`jsecon serve`: fields over HTTP (extra `serve`).
+"""`jsecon serve`: fields over HTTP (extra `serve`), and the page that `jsecon view` serves.
 
 FastAPI makes /openapi.json from the models below, and answers each question in a thread; a scene computes one at a
 time. A request reads only the fields, and photographs are added in memory: no name in it is a path.
@@ -16,7 +16,7 @@ import re
 import socket
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 from urllib.parse import urlsplit
@@ -35,10 +35,12 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 import jsecon
 from jsecon.app import verbs
 from jsecon.app.opening import find_scene, name_fields
-from jsecon.app.records import At
+from jsecon.app.records import Answer, At, Query, Region
 from jsecon.app.scene import Scene, open_prepared
+from jsecon.app.viewer.page import answer_record, drawn_gaussians, page
 from jsecon.change.history import events
 from jsecon.errors import InputError, describe_error
+from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.pipeline.progress import Console
 
 MAX_BODY, MAX_FRAME = 64 * 1024, 32 * 1024 * 1024
@@ -84,6 +86,19 @@ class _NewFrame(_Request):
     name: Annotated[str, StringConstraints(pattern=r"^[\w-][\w.-]{0,80}\.(jpg|jpeg|png)$")]
     image: Base64Bytes = Field(description="The file's bytes in base64")
     pose: dict[_PoseKey, Any] | None = Field(None, description="A frame of a transforms.json; by default it is found")
+
+
+class _Questions(BaseModel):
+    """Texts and ids of regions, and the threshold of the page."""
+
+    model_config = ConfigDict(extra="forbid")
+    questions: list[Text | StrictInt] = Field(max_length=32)
+    threshold: Annotated[StrictFloat | StrictInt, Field(ge=0, le=1)] = SHARE_THRESHOLD
+
+    def ask(self, scene: Scene) -> list[Answer | InputError]:
+        """The answer or the error of each question."""
+        questions = [Region(question) if isinstance(question, int) else question for question in self.questions]
+        return scene.ask_all([Query(question, threshold=self.threshold) for question in questions])
 
 
 class _AsciiResponse(JSONResponse):
@@ -215,7 +230,7 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     @app.get("/selection.ply", summary="The selected Gaussians in the capture's world")
     def selection(request: Annotated[_Selection, Parameters()]) -> Response:
         scene = find_scene(scenes, request.field)
-        return ply_response(scene, scene.ask(request.text, by=request.by).mask)
+        return _ply_response(scene, scene.ask(request.text, by=request.by).mask)
 
     @app.get("/healthz", summary="The fields and their frames")
     async def health() -> Response:
@@ -245,7 +260,31 @@ def application(scenes: dict[str, Scene], *, token: str = "") -> FastAPI:
     return app
 
 
-def ply_response(scene: Scene, mask: Bool[np.ndarray, " n"]) -> Response:
+def page_application(scene: Scene, texts: Sequence[str] = ()) -> FastAPI:
+    """Makes the ASGI application of a scene's page, which highlights some texts when it opens."""
+    scenes = {scene.name: scene}
+    drawn = drawn_gaussians(scene.field)[0]
+    content = page(scene.field, dict.fromkeys(texts), title=scene.name, served=True).encode()
+    app = application(scenes)
+
+    @app.get("/", summary="The page")
+    async def index() -> Response:
+        return Response(content, media_type="text/html; charset=utf-8")
+
+    @app.post("/ask", summary="The words of each answer, and a bit for each Gaussian of the page")
+    def ask(request: _Questions) -> dict[str, list]:
+        return {"answers": [answer_record(result, drawn) for result in request.ask(scenes[scene.name])]}
+
+    @app.post("/selection.ply", summary="The Gaussians of all answers in the capture's world")
+    def selection(request: _Questions) -> Response:
+        answers = request.ask(scenes[scene.name])
+        masks = [answer.mask for answer in answers if isinstance(answer, Answer)]
+        return _ply_response(scene, np.any(masks, axis=0) if masks else np.zeros(len(drawn), bool))
+
+    return app
+
+
+def _ply_response(scene: Scene, mask: Bool[np.ndarray, " n"]) -> Response:
     """The Gaussians of a mask as a .ply in the capture's world; InputError if there is none."""
     if not mask.any():
         raise InputError("selection", "no Gaussian is selected", remedy="Ask with other words.")

@@ -551,7 +551,7 @@ class Doctor(Verb):
 
 
 VERBS: dict[type[Verb], str] = {
-    Demo: "demo.demo:_demo",
+    Demo: "app.running:_demo",
     Run: "app.running:_run",
     Fit: "app.running:_fit",
     Query: "app.querying:_query",

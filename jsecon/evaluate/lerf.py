@@ -109,24 +109,19 @@ def _row(
     camera = jax.tree.map(jnp.asarray, camera)
     rendering = render_selection(gaussians, camera, selection.mask, selection.similarity)
     mask = np.asarray(rendering.alpha) > alpha_threshold
-    point = _middle(largest_pixels(np.asarray(rendering.features[..., 0])))
+    point = _peak(np.asarray(rendering.features[..., 0]))
     share = float(iou(mask, true)) if true.any() else 0.0
     located = localization_accuracy([point], [boxes]) > 0
     return Row(frame.name, category, share, located, point, count, region, score, mask)
 
 
-def largest_pixels(image: np.ndarray) -> np.ndarray:
-    """(H, W) bool the largest pixels of the smoothed image, if they are positive."""
+def _peak(image: np.ndarray) -> tuple[int, int] | None:
+    """x, y of the pixel nearest to the centre of the largest pixels of the smoothed image; None if none is positive."""
     window = 2 * round(0.04 * image.shape[0] / 2) + 1  # side of a box filter, px: LangSplat's 30 of 730
     smooth = cv2.blur(image.astype(np.float64), (window, window), borderType=cv2.BORDER_REFLECT_101)
-    return (smooth >= smooth.max() * (1 - 1e-6)) & (image.max() > 0)
-
-
-def _middle(where: np.ndarray) -> tuple[int, int] | None:
-    """x, y of the pixel of a mask nearest to its centre; None for an empty mask."""
-    y, x = np.nonzero(where)
-    if not len(y):
+    if not image.max() > 0:
         return None
+    y, x = np.nonzero(smooth >= smooth.max() * (1 - 1e-6))
     middle = np.argmin((x - x.mean()) ** 2 + (y - y.mean()) ** 2)
     return int(x[middle]), int(y[middle])
 

@@ -12,7 +12,9 @@ paper's GT-anchored query). Gaussians are then compared with regions, so almost 
 All but `trim` and `answer_question` can be traced: jit them, or vmap them over texts.
 """
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,7 @@ from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
 from jsecon.field.similarity import Number, similarities
 from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
-from jsecon.programs import numpy_outside_traces, stored_jit
+from jsecon.programs import stored_jit
 from jsecon.query.match import (
     MIN_FRAGMENT_OVERLAP,
     NO_REGIONS,
@@ -122,7 +124,21 @@ def match_regions(
     return _match((*regions, queries, excluded, unrelated_words(field)), rules)
 
 
-@numpy_outside_traces
+def _numpy_outside_traces(function: Callable) -> Callable:
+    """Gives a function of a tuple of arrays and of rules NumPy's arrays outside of a trace: it compiles no program."""
+    compiled = jax.jit(lambda arrays, rules: function(*arrays, rules))
+
+    @functools.wraps(function)
+    def call(arrays: tuple, rules: Any) -> Any:
+        if is_traced((arrays, rules)):
+            return compiled(arrays, rules)
+        with np.errstate(invalid="ignore"):
+            return function(*jax.tree.map(np.asarray, arrays), rules)
+
+    return call
+
+
+@_numpy_outside_traces
 def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRules) -> RegionMatch:
     xp = array_module(embeddings, queries, rules.min_rank)
     word_scores = compare_words(embeddings, words, rules.retrieval)
@@ -174,7 +190,7 @@ def match_region(field: LanguageField, region: Number, rules: QueryRules = ONE_R
     return _match_one((field.regions.embeddings, field.votes.overlap, region), rules)
 
 
-@numpy_outside_traces
+@_numpy_outside_traces
 def _match_one(embeddings, overlap, region, rules: QueryRules) -> RegionMatch:
     xp = array_module(embeddings, region)
     valid, row = (region >= 0) & (region < len(embeddings)), xp.clip(region, 0, len(embeddings) - 1)

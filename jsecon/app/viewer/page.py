@@ -1,8 +1,8 @@
 """The page of a field: its Gaussians, regions, frames and the answers to texts in one HTML text. Pure functions.
 
-As a file it needs no server and no outside resource. Where it is served (`jsecon.app.viewer.served`), it asks for the
-answers. A Gaussian takes 19 bytes before base64: its centre in 16 bits along each side of the scene's box, quaternion,
-sizes and colour (spherical harmonics of degree 0) in 8 bits a number, its region in 16.
+As a file it needs no server and no outside resource. Where it is served (`jsecon.app.server`), it asks for the answers.
+A Gaussian takes 19 bytes before base64: its centre in 16 bits along each side of the scene's box, quaternion, sizes and
+colour (spherical harmonics of degree 0) in 8 bits a number, its region in 16.
 """
 
 import base64

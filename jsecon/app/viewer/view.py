@@ -1,5 +1,6 @@
 """`jsecon view`: the page of a field, served or as a file."""
 
+import threading
 from pathlib import Path
 
 from jsecon.app import verbs
@@ -13,15 +14,21 @@ from jsecon.pipeline.progress import Console
 
 
 def _view(verb: verbs.View, console: Console) -> verbs.VerbResult:
-    """Does the work of `jsecon view`."""
+    """Does the work of `jsecon view`: address, and under "then" what answers requests until it is stopped."""
     if verb.export is not None:
         return _export_page(verb, verb.export, console)
     try:
-        from jsecon.app.viewer.served import serve_page
+        from jsecon.app.server import listen, page_application, runner
     except ModuleNotFoundError as error:
         remedy = 'Run: pip install "jsecon[serve]". Or write a page with --export.'
         raise InputError("jsecon view", f"the package {error.name} is missing", remedy=remedy) from error
-    return serve_page(verb, console)
+    listening, address = listen("127.0.0.1", verb.port)
+    # Without its model a field can be clicked, so the model is opened when the first text is asked.
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    app = page_application(scene, list(dict.fromkeys(verb.texts)))
+    console.print_line(f"{scene}\n{address}")
+    threading.Thread(target=scene.prepare).start()
+    return {"address": address, "then": runner(app, listening)}
 
 
 def _export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbResult:
