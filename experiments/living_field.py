@@ -22,7 +22,7 @@ import numpy as np
 from experiments import results
 from jsecon import LanguageField, Scene, load_capture, open_scene
 from jsecon.errors import InputError
-from jsecon.field.evidence import sum_evidence, unpack_views
+from jsecon.field.evidence import TOP, sum_packed
 from jsecon.field.ledger import add_views, view_order
 from jsecon.pipeline.new_frames import read_frames
 
@@ -68,7 +68,7 @@ def forgotten_clean(scene: Scene) -> tuple[int, int, int]:
     for name in names:
         less, view = scene.forget([name]), scene.ledger.views[name]
         others = [scene.ledger.views[n].evidence for n in sorted({*scene.ledger.views} - {name}, key=view_order)]
-        expected = sum_evidence(unpack_views(others, count, regions), count, regions)
+        expected = sum_packed(others, count, regions).votes(TOP)
         votes += all(np.array_equal(getattr(less.field.votes, n), getattr(expected, n)) for n in SUMS)
         with tempfile.TemporaryDirectory() as folder:
             less.save(Path(folder, "field.safetensors"))

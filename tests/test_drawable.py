@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jsecon
-from jsecon.splat.project import check_gaussians, count_non_finite
+from jsecon.splat.project import check_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,6 @@ REFUSED = [
 @pytest.mark.parametrize("how", HELD)
 def test_what_can_be_drawn_comes_back_from_fields_and_files(scene, camera, field, tmp_path, how):
     odd = changed(scene, **HELD[how])
-    assert int(count_non_finite(odd)) == 0
     drawn = jsecon.render_rgb(odd, camera).features
     assert np.isfinite(np.asarray(drawn)).all()
     jsecon.save_field(tmp_path / "f.safetensors", dataclasses.replace(field, gaussians=odd))

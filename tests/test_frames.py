@@ -12,7 +12,7 @@ from conftest import cameras_of, gaussians_at, look_at
 
 from jsecon import load_capture, open_scene, render_rgb
 from jsecon.association.scene import SceneSuperpixels, label_by_regions, one_hot
-from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
+from jsecon.poses.resection import MIN_INLIERS, pose_finder
 
 
 def centre(pose):
@@ -37,8 +37,8 @@ def bumpy_wall():
 def test_a_photograph_finds_its_pose_by_those_of_the_field(bumpy_wall):
     scene, cameras, pictures = bumpy_wall
     others = np.array([0, 1, 3, 4])
-    landmarks = Landmarks(scene, cameras[others], [pictures[t] for t in others])
-    found, inliers = find_pose(pictures[2], landmarks)
+    find_pose = pose_finder(scene, cameras[others], [pictures[t] for t in others])
+    found, inliers = find_pose(pictures[2])
     assert inliers >= 2 * MIN_INLIERS
     pose, true = (np.asarray(c.world_to_camera, np.float64) for c in (found, cameras[2]))
     assert np.degrees(np.arccos(np.clip((np.trace(pose[:3, :3] @ true[:3, :3].T) - 1) / 2, -1, 1))) < 0.2
@@ -47,10 +47,10 @@ def test_a_photograph_finds_its_pose_by_those_of_the_field(bumpy_wall):
     moved[:, :3, 3] += moved[:, :3, :3] @ centre(true)
     own = dataclasses.replace(scene, means=np.asarray(scene.means) - centre(true).astype(np.float32))
     cameras_there = dataclasses.replace(cameras[others], world_to_camera=moved[others])
-    there, _ = find_pose(pictures[2], Landmarks(own, cameras_there, [pictures[t] for t in others]))
+    there, _ = pose_finder(own, cameras_there, [pictures[t] for t in others])(pictures[2])
     assert np.linalg.norm(centre(np.asarray(there.world_to_camera, np.float64))) < 0.01
     zoomed = cv2.resize(pictures[2][15:135, 20:180], (200, 150))  # another lens: 1.25 times the focal length
-    found, _ = find_pose(zoomed, landmarks)
+    found, _ = find_pose(zoomed)
     assert float(found.fx) == pytest.approx(250, rel=0.02)
     assert np.linalg.norm(centre(np.asarray(found.world_to_camera, np.float64)) - centre(true)) < 0.05
 
@@ -58,9 +58,9 @@ def test_a_photograph_finds_its_pose_by_those_of_the_field(bumpy_wall):
 def test_photographs_of_another_place_have_no_pose(bumpy_wall):
     scene, cameras, pictures = bumpy_wall
     noise = np.random.default_rng(1).integers(0, 256, (150, 200, 3), np.uint8)
-    landmarks = Landmarks(scene, cameras, pictures)
+    find_pose = pose_finder(scene, cameras, pictures)
     for photo in (cv2.GaussianBlur(noise, (0, 0), 2), np.full_like(noise, 90)):
-        found, inliers = find_pose(photo, landmarks)
+        found, inliers = find_pose(photo)
         assert found is None
         assert inliers < MIN_INLIERS
 

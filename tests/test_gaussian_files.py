@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from splat_files import gaussians, opacity, scene, spz_record
 
 from jsecon import Gaussians, load_gaussians, save_gaussians
+from jsecon.read.splats import ply
 from jsecon.read.splats.files import read_gaussians
 from jsecon.splat import transform
 
@@ -67,7 +68,7 @@ def test_blocks_of_any_size_give_the_same_bytes_in_another_world(tmp_path, monke
     given, ids = gaussians(SCENE), {"ids": {"object_id": np.arange(600) % 7 - 1}}
     files = [tmp_path / f"{name}.ply" for name in ("whole", "blocks")]
     save_gaussians(files[0], given, **ids, similarity=turn)
-    monkeypatch.setattr(transform, "BLOCK_ROWS", 77)
+    monkeypatch.setattr(ply, "BLOCK_ROWS", 77)
     save_gaussians(files[1], given, **ids, similarity=turn)
     assert files[0].read_bytes() == files[1].read_bytes()
     assert b"property double" not in files[0].read_bytes()  # as INRIA's readers expect an ordinary scene

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jsecon.fit.start import back_project_frame, points_from_depth
-from jsecon.splat.points import voxel_ids
+from jsecon.fit.start import points_from_depth
+from jsecon.splat.points import back_project
 from jsecon.types import Array, Capture
 
 
@@ -29,10 +29,20 @@ def sampled_points(capture: Capture, *, voxel: float, stride: int) -> SampledPoi
         points_from_depth(capture, voxel=voxel, stride=stride),
         np.flatnonzero(~np.asarray(capture.held_out)),
     )
-    worlds, _, pixels = zip(*(back_project_frame(capture, int(t), stride) for t in chosen))
+    worlds, pixels = zip(*(_back_project_frame(capture, int(t), stride) for t in chosen))
     frame = np.repeat(chosen, [len(world) for world in worlds])
     pixels = np.column_stack([frame, np.concatenate(pixels)])
-    return SampledPoints(cloud.points, cloud.colors, pixels, voxel_ids(np.concatenate(worlds), voxel))
+    samples = np.concatenate(worlds)
+    cells = np.floor((samples - samples.min(axis=0)) / voxel).astype(np.int64)
+    return SampledPoints(cloud.points, cloud.colors, pixels, np.unique(cells, axis=0, return_inverse=True)[1])
+
+
+def _back_project_frame(capture: Capture, frame: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """World points (S, 3) of the known depths of a frame, and their pixels (S, 2) row, column."""
+    depth = np.asarray(capture.depths[frame], np.float64)[::stride, ::stride]
+    known = np.isfinite(depth) & (depth > 0)
+    pixels = np.argwhere(known) * stride
+    return back_project(capture.cameras[frame], pixels, depth[known]), pixels
 
 
 def confirmed_depths(capture: Capture, *, tolerance: float, min_views: int) -> Float[np.ndarray, "t h w"]:
@@ -47,7 +57,7 @@ def confirmed_depths(capture: Capture, *, tolerance: float, min_views: int) -> F
     height, width = depths.shape[1:]
     filtered = depths.copy()
     for t in chosen:
-        world, _, pixels = back_project_frame(capture, int(t), 1)
+        world, pixels = _back_project_frame(capture, int(t), 1)
         same, past = np.zeros(len(world), np.int32), np.zeros(len(world), np.int32)
         for other in chosen[chosen != t]:
             camera = capture.cameras[int(other)]

@@ -89,11 +89,6 @@ class ViewEvidence(NamedTuple):
         gaussians, starts, regions, weights, largest = map(np.asarray, columns)
         return ViewEvidence(gaussians, starts, regions, weights, largest)
 
-    def totals(self) -> Float[np.ndarray, " m"]:
-        """Sums the weight of each Gaussian, float64."""
-        shape = len(self.gaussians), max(self.regions.max(initial=0) + 1, 1)
-        return sparse.csr_matrix((self.weights, self.regions, self.starts), shape=shape) @ np.ones(shape[1])
-
     def matrix(self, count: int, num_regions: int) -> Any:
         """Lays the list out as a scipy.sparse.csr_matrix (N, R + 1)."""
         lengths = np.zeros(count + 1, np.int32)
@@ -185,21 +180,10 @@ def list_evidence(
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
 
     def view(t: int) -> tuple:  # a plain one, which processes can exchange
-        evidence = view_evidence(gaussians, cameras[t], np.asarray(labels[t]), num_regions, **options)
+        evidence = plan_evidence(gaussians, cameras[t], **options)(np.asarray(labels[t]), num_regions)
         return tuple(evidence if folder is None else _on_disk(evidence, folder / str(t)))
 
     return [ViewEvidence(*evidence) for evidence in map_views(len(labels), view, progress)]
-
-
-def view_evidence(
-    gaussians: Gaussians,
-    camera: Camera,
-    labels: Shaped[np.ndarray, "h w"],
-    num_regions: int,
-    **options: Any,
-) -> ViewEvidence:
-    """Lists what one view casts on N Gaussians; options as for `plan_evidence`. Host code."""
-    return plan_evidence(gaussians, camera, **options)(labels, num_regions)
 
 
 def plan_evidence(
@@ -210,7 +194,7 @@ def plan_evidence(
     capacity: int | None = None,
     near: float = NEAR,
 ) -> CastLabels:
-    """Plans a view once; the function that it returns is `view_evidence` of any labels. Host code.
+    """Plans a view once; the function that it returns lists what the view casts on N Gaussians. Host code.
 
     Options as for `region_votes`.
     """
@@ -414,7 +398,7 @@ def sum_evidence(
 ) -> Votes:
     """Adds up the lists of views to votes of `count` Gaussians, a block of rows at a time; see `region_votes`."""
     if folder is None:
-        votes = sum_views(views, count, num_regions, by_view=by_view).votes(top)
+        votes = _sum_views(views, count, num_regions, by_view).votes(top)
     else:
         columns = (_cut_sum(each, top) for each in _sum_blocks(views, count, num_regions, by_view))
         votes = _make_votes(_write_columns(Path(folder), columns, count), sum(v.overflow for v in views), num_regions)
@@ -462,7 +446,8 @@ def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_v
     each = np.zeros((len(views) if by_view else 0, count), np.float32).T
     dense = np.zeros((count, num_regions + 1) if len(views) != 1 else (0, 0))
     for t, view in enumerate(views):
-        own = view.totals()
+        shape = len(view.gaussians), num_regions + 1
+        own = sparse.csr_matrix((view.weights, view.regions, view.starts), shape) @ np.ones(num_regions + 1)
         total[view.gaussians] += own
         seen[view.gaussians] += 1
         peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
@@ -505,10 +490,10 @@ def _strongest(
 
 
 def add_evidence(
-    evidence: EvidenceSum, views: Sequence[ViewEvidence], places: Sequence[int], num_regions: int
+    evidence: EvidenceSum, views: Sequence[UInt8[np.ndarray, " _"]], places: Sequence[int], num_regions: int
 ) -> EvidenceSum:
-    """Adds views to a sum, to the same bits as if all were summed at once; `places` are their columns of `by_view`."""
-    more, count = sum_views(views, len(evidence.total), num_regions), len(evidence.views)
+    """Adds packed views to a sum, to the same bits as all at once; `places` are their columns of `by_view`."""
+    more, count = sum_packed(views, len(evidence.total), num_regions), len(evidence.views)
     old = evidence.weights
     weights = sparse.csr_matrix((old.data, old.indices, old.indptr), shape=(count, num_regions)) + more.weights
     by_view = np.empty((count, evidence.by_view.shape[1] + len(views)), np.float32, order="F")
@@ -519,7 +504,14 @@ def add_evidence(
     return EvidenceSum(weights, *sums, peak, by_view, evidence.overflow + more.overflow)
 
 
-def sum_views(views: Sequence[ViewEvidence], count: int, num_regions: int, *, by_view: bool = True) -> EvidenceSum:
+def sum_packed(views: Sequence[UInt8[np.ndarray, " _"]], count: int, num_regions: int) -> EvidenceSum:
+    """Unpacks the lists of views (`pack_evidence`) on all cores, and adds them up."""
+    with ThreadPoolExecutor(cores()) as pool:
+        lists = list(pool.map(lambda view: _unpack_evidence(view, count, num_regions), views))
+    return _sum_views(lists, count, num_regions, by_view=True)
+
+
+def _sum_views(views: Sequence[ViewEvidence], count: int, num_regions: int, by_view: bool) -> EvidenceSum:
     """Adds up the lists of views, before the cut to the strongest regions."""
     weights, *columns, overflow = zip(*_sum_blocks(views, count, num_regions, by_view))
     return EvidenceSum(sparse.vstack(weights, "csr"), *map(np.concatenate, columns), overflow=overflow[0])
@@ -560,17 +552,6 @@ def _unpack_evidence(packed: UInt8[np.ndarray, " b"], count: int, num_regions: i
         raise ValueError("the evidence of a view is damaged")
     rows = ids.astype(np.int32), starts, regions, weights.view(np.float32), peaks.view(np.float32)
     return ViewEvidence(*rows, int(overflow))
-
-
-def unpack_views(packed: Sequence[UInt8[np.ndarray, " _"]], count: int, num_regions: int) -> list[ViewEvidence]:
-    """Unpacks the lists of views on all cores."""
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda view: _unpack_evidence(view, count, num_regions), packed))
-
-
-def votes_memory(count: int, views: int) -> int:
-    """Bounds the bytes of `region_votes` with `by_view`, beside its inputs, if every view sees all Gaussians."""
-    return (4 + 24) * views * count
 
 
 def _centre_pixels(

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from jsecon.errors import require
-from jsecon.field.evidence import TOP, EvidenceSum, add_evidence, sum_views, unpack_views
+from jsecon.field.evidence import TOP, EvidenceSum, add_evidence, sum_packed
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import unit_rows
 from jsecon.types import Camera, LanguageField, Regions
@@ -88,8 +88,8 @@ def add_views(field: LanguageField, ledger: Ledger, views: Mapping[str, LedgerVi
     before = sum_ledger(field, ledger).sum
     assert before is not None
     new = [name for name in ordered if name in views]
-    lists = unpack_views([views[name].evidence for name in new], field.gaussians.count, count)
-    total = add_evidence(before, lists, [ordered.index(name) for name in new], count)
+    packed = [views[name].evidence for name in new]
+    total = add_evidence(before, packed, [ordered.index(name) for name in new], count)
     return _build_field(field, Ledger(count, {**ledger.views, **views}, total), {*field.names, *views}, grows=is_cut)
 
 
@@ -122,8 +122,7 @@ def sum_ledger(field: LanguageField, ledger: Ledger) -> Ledger:
     if ledger.sum is not None:
         return ledger
     packed = [ledger.views[name].evidence for name in sorted(ledger.views, key=view_order)]
-    lists = unpack_views(packed, field.gaussians.count, ledger.num_regions)
-    return dataclasses.replace(ledger, sum=sum_views(lists, field.gaussians.count, ledger.num_regions))
+    return dataclasses.replace(ledger, sum=sum_packed(packed, field.gaussians.count, ledger.num_regions))
 
 
 def _build_field(

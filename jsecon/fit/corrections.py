@@ -5,15 +5,13 @@ correction of an exposure is an affine map from rendered colours to the colours 
 offset). Each view has a row, which Adam moves when that view is drawn, with separate moments.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
-from jsecon.types import Array, Camera, record
+from jsecon.types import Array, record
 
 _TERMS = 24
 """Terms of the power series of a rigid motion: exact to float64 for rotations of up to 3 radians."""
@@ -51,11 +49,6 @@ class CorrectionRates(NamedTuple):
     """Each number of a colour map."""
 
 
-def identity_corrections(views: int) -> Corrections:
-    """Makes corrections without effect (NumPy)."""
-    return Corrections(np.zeros((views, 6), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (views, 1, 1)))
-
-
 def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
     """Computes the rigid motion of a twist of up to 3 radians: the exponential of its matrix, by its power series."""
     x, y, z, a, b, c = twist
@@ -67,17 +60,3 @@ def se3_exp(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
         return identity + (matrix[:, :, None] * motion[None]).sum(1) / (_TERMS - n)
 
     return jax.lax.fori_loop(0, _TERMS, next_power, identity)
-
-
-def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
-    """Moves a camera by a twist in its frame: exp(twist) world_to_camera."""
-    motion, pose = se3_exp(twist), camera.world_to_camera
-    # Multiply-and-sum: exact float32 on every backend.
-    moved = (motion[:, :, None] * pose[None, :, :].astype(motion.dtype)).sum(1)
-    return dataclasses.replace(camera, world_to_camera=moved)
-
-
-def apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
-    """Applies the colour map of a view to rendered colours, without clamping."""
-    r, g, b = image[..., 0], image[..., 1], image[..., 2]
-    return jnp.stack([row[0] * r + row[1] * g + row[2] * b + row[3] for row in colour], axis=-1)

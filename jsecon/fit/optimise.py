@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jsecon.errors import InputError, require
-from jsecon.fit.corrections import CorrectionRates, CorrectionState, identity_corrections
+from jsecon.fit.corrections import CorrectionRates, Corrections, CorrectionState
 from jsecon.fit.growth import drop_free_rows, grow, pad_with_free_rows
 from jsecon.fit.step import LearningRates, StepRunner, TrainState, put_on_devices
 from jsecon.parallel import host_mesh
@@ -110,7 +110,8 @@ def _init_fit_state(gaussians: Gaussians, corrected_frames: int | None = None, *
     scene = pad_with_free_rows(jax.tree.map(lambda a: np.asarray(a, np.float32), gaussians), rows)
     zeros, zero, corrections = jax.tree.map(np.zeros_like, scene), np.zeros((), np.float64), None
     if corrected_frames is not None:
-        identity = identity_corrections(corrected_frames)
+        turns = np.zeros((corrected_frames, 6), np.float32)
+        identity = Corrections(turns, np.tile(np.eye(3, 4, dtype=np.float32), (corrected_frames, 1, 1)))
         no_moments = jax.tree.map(np.zeros_like, identity)
         corrections = CorrectionState(identity, no_moments, no_moments)
     train = TrainState(scene, zeros, zeros, zeros.opacity_logits, corrections)

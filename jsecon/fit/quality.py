@@ -17,8 +17,6 @@ QUICK_LONG_SIDE = 400
 """Longer side in px at which weak frames are looked for: a thousand large frames would take half an hour."""
 MIN_COUNTED_SHARE = 0.01
 """Least share of the pixels of a frame that must count: fewer measure nothing."""
-MIN_GAP_DB, MIN_GAP_SPREADS = 5.0, 5.0
-"""Least distance below the median PSNR at which a frame is called weak, in dB, and in median absolute deviations."""
 
 
 def _compare(
@@ -27,11 +25,11 @@ def _compare(
     """PSNR over the counted pixels, and the mean SSIM over their windows, with the rendering in place of the others."""
     image = np.clip(image, 0, 1)
     target = np.where(counted[..., None], frame.astype(np.float32) / 255, image)
-    similarity = ssim_map(image, target)[counted].mean(dtype=np.float64)
+    similarity = _ssim_map(image, target)[counted].mean(dtype=np.float64)
     return float(psnr(image[counted], target[counted])), float(similarity)
 
 
-def ssim_map(image: Float[np.ndarray, "h w c"], target: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+def _ssim_map(image: Float[np.ndarray, "h w c"], target: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
     """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13).
 
     OpenCV blurs: no program is compiled for a size.
@@ -92,13 +90,3 @@ def measure_quality(
 
     by_frame = np.array(map_over_processes(len(chosen), rows, progress)).reshape(-1, 2)
     return Quality(chosen, by_frame[:, 0], by_frame[:, 1])
-
-
-def is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Finds frames far below the median PSNR (dB): wrong poses, moving things, a finger before the lens."""
-    values = np.asarray(psnr, np.float64)
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return np.zeros(len(values), bool)
-    median = np.median(known)
-    return median - values > max(MIN_GAP_DB, MIN_GAP_SPREADS * float(np.median(np.abs(median - known))))

@@ -34,23 +34,6 @@ class _DepthPoints(NamedTuple):
     """edge of a voxel, world units."""
 
 
-def back_project_frame(capture: Capture, frame: int, stride: int):
-    """Back-projects the known depths of one frame, of every `stride`-th pixel in each direction.
-
-    Returns:
-      World points (S, 3) float64, their colours (S, 3) uint8 and pixels (S, 2) row, column.
-    """
-    camera = capture.cameras[frame]
-    if capture.depths is None:
-        raise InputError("capture", "no depth frames", "RGB-D frames", "Use sparse points, or triangulate points.")
-    depth = np.asarray(capture.depths[frame], np.float64)[::stride, ::stride]
-    rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
-    z = depth[rows, columns]
-    rows, columns = rows * stride, columns * stride
-    pixels = np.stack([rows, columns], axis=1)
-    return back_project(camera, pixels, z), np.asarray(capture.frames[frame])[rows, columns], pixels
-
-
 def points_from_depth(
     capture: Capture, *, voxel: float = 0.0, max_points: int | None = None, stride: int = 1
 ) -> _DepthPoints:
@@ -63,11 +46,18 @@ def points_from_depth(
       stride: Uses every so many pixels in each direction.
     """
     require(voxel > 0 or max_points is not None, "voxel", voxel, "above 0", "Give it, or max_points.")
-    chosen = np.flatnonzero(~np.asarray(capture.held_out))
-    parts = [back_project_frame(capture, int(t), stride) for t in chosen]
-    if not any(len(world) for world, _, _ in parts):
+    if capture.depths is None:
+        raise InputError("capture", "no depth frames", "RGB-D frames", "Use sparse points, or triangulate points.")
+    parts = []
+    for t in np.flatnonzero(~np.asarray(capture.held_out)).tolist():
+        depth = np.asarray(capture.depths[t], np.float64)[::stride, ::stride]
+        known = np.isfinite(depth) & (depth > 0)
+        pixels = np.argwhere(known) * stride
+        world = back_project(capture.cameras[t], pixels, depth[known])
+        parts.append((world, np.asarray(capture.frames[t])[*pixels.T]))
+    if not any(len(world) for world, _ in parts):
         raise InputError("capture", "no pixel with a known depth", "depths above 0", "Check their encoding and unit.")
-    points, colors, _ = (np.concatenate(columns) for columns in zip(*parts))
+    points, colors = (np.concatenate(columns) for columns in zip(*parts))
     means, colors, voxel = voxel_means(points, colors, max_points, voxel)
     return _DepthPoints(means.astype(np.float32), colors, voxel)
 

@@ -1,7 +1,7 @@
 """Distillation: the codes of the regions become codes of the Gaussians.
 
 With the geometry fixed the rendered map is linear in the features, F_p = sum_i w_ip f_i, and the target of a pixel is
-the code l_r(p) of its region. The paper minimises L = sum_p |F_p - l_r(p)| by Adam (`rendered_l1`, `distill_l1`). The
+the code l_r(p) of its region. The paper minimises L = sum_p |F_p - l_r(p)| by Adam (`distill_l1`). The
 votes W_ir = sum of w_ip over the pixels of r hold all that a closed form needs (`distill_votes`):
 
     mode      l_r of the largest W_ir
@@ -114,7 +114,7 @@ def distill_l1(
     key: Key,
     init: Float[Array, "n d"] | None = None,
 ) -> _Distillation:
-    """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1 (`rendered_l1`), with rate 0.0025.
+    """Distills as the paper does (LangSplat, train.py): Adam on the rendered L1, with rate 0.0025.
 
     One view a step, all views before any repeats, in an order drawn from `key`. The geometry is fixed.
 
@@ -158,7 +158,7 @@ def distill_l1(
         capacity = plan_capacity(gaussians, cameras, margin=1.0)
     trained, losses = _descend(features, gaussians, cameras, labels, table, plans, order, capacity)
     if not is_traced(losses):
-        remedy = "Check the Gaussians with jsecon.splat.project.count_non_finite."
+        remedy = "Remove the Gaussians and region codes that are not finite."
         finite = not bool(jnp.isnan(losses).any())
         require(finite, "distill_l1", "a loss that is NaN", "finite Gaussians and codes", remedy)
     codes = normalize(trained)
@@ -168,7 +168,7 @@ def distill_l1(
     return _Distillation(codes, losses)
 
 
-def rendered_l1(
+def _rendered_l1(
     features: Float[Array, "n d"], plan: ViewPlan, labels: Integer[Array, "h w"], region_codes: Float[Array, "r d"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow.
@@ -203,7 +203,7 @@ def _descend(features, gaussians, cameras, labels, region_codes, plans, order, c
             plan = plan_view(gaussians, cameras[view], capacity=capacity)
         else:
             plan = jax.tree.map(lambda a: a[view], plans)
-        return rendered_l1(features, plan, labels[view], codes)
+        return _rendered_l1(features, plan, labels[view], codes)
 
     def step(state, view):
         features, moments = state

@@ -19,7 +19,7 @@ from jsecon.field.ledger import Ledger, LedgerView, camera_row, view_order
 from jsecon.field.membership import LABELLED_PART, SHARE_THRESHOLD
 from jsecon.files import parse_json
 from jsecon.fit.resize import resize_camera, resize_capture, resize_frame
-from jsecon.poses.resection import MIN_INLIERS, Landmarks, find_pose
+from jsecon.poses.resection import MIN_INLIERS, pose_finder
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.capture import lone_photographs, read_posed_images
 from jsecon.read.captures.frames import FrameOptions, frame_names, move_capture, take_frames
@@ -94,7 +94,7 @@ def _place(
     """Finds the poses of photographs by the pictures of the ledger."""
     rows = [t for t, name in enumerate(field.names) if name in ledger.views]
     views = jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras)
-    landmarks = Landmarks(field.gaussians, views, [decode_jpeg(ledger.views[field.names[t]].picture) for t in rows])
+    find_pose = pose_finder(field.gaussians, views, [decode_jpeg(ledger.views[field.names[t]].picture) for t in rows])
     names, cameras, frames = [], [], []
     for done, (name, file) in enumerate(files.items()):
         try:
@@ -104,7 +104,7 @@ def _place(
             continue
         size = FrameOptions(long_side=max(views.width, views.height)).size(photo.shape[1::-1])
         photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-        camera, inliers = find_pose(photo, landmarks)
+        camera, inliers = find_pose(photo)
         if camera is None:
             problem = f"only {inliers} of its features agree with the field on a pose, {MIN_INLIERS} needed"
             remedy = "Photograph more of what the field shows, from nearer to its views, or give its pose (--poses)."

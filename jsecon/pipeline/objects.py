@@ -16,7 +16,7 @@ from jsecon.association.consensus import Objects, track_masks
 from jsecon.association.scene import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
-from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence, votes_memory
+from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence
 from jsecon.field.regions import choose_crops, crop_geometry, join_views, region_embeddings, views_needed
 from jsecon.fit.start import points_from_depth
 from jsecon.networks.hub import model_name
@@ -46,6 +46,8 @@ from jsecon.vision.surfaces import surfaces_from_depth
 
 PART_CROPS, PART_PX = 2, 100
 """Largest number of views in which a part is embedded, and its least pixels there: fewer show an encoder little."""
+_BYTES_OF_VOTES = 4 + 24
+"""Bytes that votes take for each view and Gaussian while they are added up, if every view sees all Gaussians."""
 
 
 def plan_objects(context: RunContext) -> list[Stage]:
@@ -299,7 +301,7 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     cameras, count = capture.cameras[frames], int(labels.max()) + 1
     if capture.ignored is not None:  # what stood before a Gaussian there says nothing of it
         labels = np.where(np.asarray(capture.ignored)[frames], IGNORED, labels)
-    needed, budget = votes_memory(scene.count, len(labels)), memory_budget()
+    needed, budget = _BYTES_OF_VOTES * scene.count * len(labels), memory_budget()
     on_disk = needed > budget and jax.process_count() == 1  # several processes exchange them in memory
     notes = ()
     if on_disk:

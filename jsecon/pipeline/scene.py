@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError, join_first
-from jsecon.fit.quality import QUICK_LONG_SIDE, is_weak, measure_quality
+from jsecon.fit.quality import QUICK_LONG_SIDE, measure_quality
 from jsecon.fit.start import starting_gaussians
 from jsecon.pipeline.ignoring import ignore_named
 from jsecon.pipeline.options import Options, is_bare_scene
@@ -42,6 +43,8 @@ from jsecon.views.capture import render_capture
 from jsecon.views.frame import find_up_axis, scene_frame, surface_points
 from jsecon.views.plan import DEFAULT_VIEWS, cover_with, place_cameras
 
+MIN_GAP_DB, MIN_GAP_SPREADS = 5.0, 5.0
+"""Least distance below the median PSNR at which a frame is called weak, in dB, and in median absolute deviations."""
 _TRAINED = "dataparser_transforms.json"
 """file of nerfstudio with the world in which it trained"""
 _NEAR_VIEWS = 48
@@ -277,13 +280,23 @@ def _measure_held_out(stage: StageInput) -> StageResult:
     train = np.flatnonzero(~np.asarray(capture.held_out))
     measure = partial(measure_quality, scene, capture, background=background, progress=stage.progress)
     fitted = measure(frames=train, long_side=QUICK_LONG_SIDE)
-    weak = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
+    weak = np.flatnonzero(_is_weak(np.asarray(fitted.psnr)))
     notes = ()
     if len(weak):
         names = join_first([f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak])
         note = f"far below the median frame ({np.median(fitted.psnr):.1f} dB): {names}; a wrong pose, or "
         notes = (note + "something moved: leave them out if the scene is blurred there",)
     return StageResult(measure(), notes=notes)
+
+
+def _is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Finds frames far below the median PSNR (dB): wrong poses, moving things, a finger before the lens."""
+    values = np.asarray(psnr, np.float64)
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return np.zeros(len(values), bool)
+    median = np.median(known)
+    return median - values > max(MIN_GAP_DB, MIN_GAP_SPREADS * float(np.median(np.abs(median - known))))
 
 
 class _Views(NamedTuple):

@@ -7,7 +7,8 @@ no part in this, so they stay.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import cv2
@@ -34,14 +35,8 @@ _TOLERANCE = 0.008
 """Distance over the longer side up to which a match agrees with a pose."""
 
 
-class Landmarks:
-    """The features of a field's views and their places in the world; each view is looked at when it is first needed.
-
-    Args:
-      gaussians: The scene.
-      cameras: Batch of T cameras.
-      pictures: T photographs of the cameras' size.
-    """
+class _Landmarks:
+    """The features of a field's views and their places in the world; each view is looked at when it is first needed."""
 
     def __init__(self, gaussians: Gaussians, cameras: Camera, pictures: Sequence[UInt8[np.ndarray, "h w 3"]]):
         self.gaussians, self.cameras, self.pictures = gaussians, jax.tree.map(np.asarray, cameras), pictures
@@ -74,16 +69,24 @@ class Landmarks:
         return features.rays[rows], places[columns]
 
 
-def find_pose(photo: UInt8[np.ndarray, "h w 3"], landmarks: Landmarks) -> tuple[Camera | None, int]:
-    """Finds where a photograph was taken, and its focal length; its lens counts as free of distortion.
+def pose_finder(
+    gaussians: Gaussians, cameras: Camera, pictures: Sequence[UInt8[np.ndarray, "h w 3"]]
+) -> Callable[[UInt8[np.ndarray, "h w 3"]], tuple[Camera | None, int]]:
+    """Makes a function that finds where a photograph was taken, and its focal length, by the views of a field.
+
+    The photograph is about as large as the views, and its lens counts as free of distortion. The function returns the
+    camera, None if too few matches agree on one, and the number of those that agree.
 
     Args:
-      photo: The photograph, about as large as the field's frames.
-      landmarks: Of the field.
-
-    Returns:
-      The camera, None if too few matches agree on one, and the number of those that agree.
+      gaussians: The scene.
+      cameras: Batch of T cameras.
+      pictures: T photographs of the cameras' size.
     """
+    return functools.partial(_find_pose, _Landmarks(gaussians, cameras, pictures))
+
+
+def _find_pose(landmarks: _Landmarks, photo: UInt8[np.ndarray, "h w 3"]) -> tuple[Camera | None, int]:
+    """Finds the camera of a photograph, and the number of matches that agree on it."""
     lens, order = landmarks._lens(*photo.shape[1::-1]), landmarks._alike(photo)
     features, error = detect_features(photo, lens), _TOLERANCE * max(photo.shape) / float(lens.fx)
     matches, count, best = [(np.zeros((0, 2)), np.zeros((0, 3)))], 0, None

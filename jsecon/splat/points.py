@@ -24,11 +24,6 @@ def back_project(camera: Camera, pixels: np.ndarray, depth: np.ndarray | float) 
     return (np.stack([x, y, np.broadcast_to(depth, x.shape)], axis=1) - pose[:3, 3]) @ pose[:3, :3]
 
 
-def voxel_ids(points: np.ndarray, voxel: float) -> np.ndarray:
-    """(S,) voxel of each point, numbered 0 .. P-1 without gaps."""
-    return np.unique(_voxel_keys(points, voxel), return_inverse=True)[1]
-
-
 def _voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:
     """(S,) a number for the voxel of each point."""
     cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
@@ -58,9 +53,9 @@ def voxel_means(
 
     Also returns the edge.
     """
-    if max_points is not None and (not voxel or voxel_ids(points, voxel).max() >= max_points):
+    if max_points is not None and (not voxel or len(np.unique(_voxel_keys(points, voxel))) > max_points):
         voxel = _voxel_for(points, max_points)
-    ids = voxel_ids(points, voxel)
+    ids = np.unique(_voxel_keys(points, voxel), return_inverse=True)[1]
     counts = np.bincount(ids)[:, None]
     means, mean_colors = (
         np.stack([np.bincount(ids, a) for a in column.T], axis=1) / counts for column in (points, colors)

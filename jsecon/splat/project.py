@@ -1,6 +1,6 @@
 """Projects 3D Gaussians to 2D splats: EWA splatting with a determinant without cancellation and exact, tight extents.
 
-Non-finite inputs disable the affected Gaussians; `count_non_finite` reports how many.
+Non-finite inputs disable the affected Gaussians.
 """
 
 import dataclasses
@@ -8,7 +8,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool
 
 from jsecon.errors import require, require_shape
 from jsecon.numerics import BLUR_PX2, FRUSTUM_MARGIN, MIN_ALPHA, NEAR, all_finite, normalize, sigmoid
@@ -42,18 +42,6 @@ def unusable_rows(name: str, numbers: np.ndarray) -> Bool[np.ndarray, " m"]:
     if name == "quaternions":
         wrong = wrong | (numbers == 0).all(axis=1, keepdims=True)
     return np.asarray(wrong.any(axis=tuple(range(1, wrong.ndim))))
-
-
-def count_non_finite(gaussians: Gaussians, features: Float[Array, "n d"] | None = None) -> Int[Array, ""]:
-    """Counts Gaussians that `render` hides, or shows as NaN in the pixels that they touch.
-
-    The latter have features (by default the spherical harmonics, if there are any) that are not finite.
-    """
-    channels = gaussians.sh if features is None else features
-    usable = _is_usable(gaussians)
-    if channels is not None:
-        usable &= jnp.isfinite(channels).all(tuple(range(1, channels.ndim)))
-    return jnp.sum(~usable, dtype=jnp.int32)
 
 
 _MAX_AXIS_PX = 1e15

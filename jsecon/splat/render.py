@@ -35,8 +35,7 @@ def render(
     that the image is exact.
 
     Non-finite inputs disable the affected Gaussians; a non-finite feature gives NaN in the pixels that its Gaussian
-    touches. Neither has a gradient or affects another's (`project.count_non_finite` counts them). A camera that is not
-    finite gives NaN everywhere.
+    touches. Neither has a gradient or affects another's. A camera that is not finite gives NaN everywhere.
 
     Args:
       gaussians: Scene of N Gaussians. Its `sh` has no influence and may be None.

@@ -24,17 +24,9 @@ class Strip:
     index: int | Array = 0
     count: int = 1
 
-    def first_row(self, rows: Array) -> Array:
-        """Counts the strip's rows of blocks before rows of blocks of the image."""
-        return (rows - self.index + self.count - 1) // self.count
-
-    def block_row(self, row: Array) -> Array:
-        """Finds the row of blocks in the image of a row of blocks in the strip."""
-        return row * self.count + self.index
-
     def tile_row(self, row: Array) -> Array:
         """Finds the row of tiles in the image of a row of tiles in the strip."""
-        return self.block_row(row // BLOCK) * BLOCK + row % BLOCK
+        return (row // BLOCK * self.count + self.index) * BLOCK + row % BLOCK
 
 
 FULL_IMAGE = Strip()

@@ -71,8 +71,8 @@ def _rectangles(projection: Projection, width: int, height: int, edge: int, stri
         # Clipped as floats first: a box may reach beyond what int32 holds.
         ranges.append(jnp.floor(jnp.clip(low, 0, limit)).astype(jnp.int32))
         ranges.append(jnp.ceil(jnp.clip(high, 0, limit)).astype(jnp.int32))
-    x0, x1, y0, y1 = ranges
-    return x0, x1, strip.first_row(y0), strip.first_row(y1)
+    x0, x1, *rows = ranges
+    return x0, x1, *((row - strip.index + strip.count - 1) // strip.count for row in rows)
 
 
 def pair_counts(projection: Projection, width: int, height: int, *, strip: Strip = FULL_IMAGE) -> Int[Array, " n"]:
@@ -204,7 +204,7 @@ def _reached_tiles(
     highest = radius / l22
     widest = -l21 * highest / jnp.sqrt(l22 * l22 + l21 * l21)  # dy of its rightmost point
     left = (blocks % across * (BLOCK * tile)).astype(x.dtype) - x
-    top = (strip.block_row(blocks // across) * (BLOCK * tile)).astype(y.dtype) - y
+    top = ((blocks // across * strip.count + strip.index) * (BLOCK * tile)).astype(y.dtype) - y
     slack = _SLACK_PX + 1e-5 * jnp.abs(slope * highest)
     bits = jnp.zeros(blocks.shape, jnp.uint32)
     for row in range(BLOCK):

@@ -1,7 +1,6 @@
 """Transforms Gaussians between worlds by a similarity: rotation, scale and shift, colours included."""
 
 import dataclasses
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +11,6 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import require
 from jsecon.splat.sh import sh_basis
 from jsecon.types import Array, Gaussians
-
-BLOCK_ROWS = 1 << 18
-"""Number of Gaussians transformed at a time."""
 
 
 @np.errstate(over="ignore", invalid="ignore")  # non-finite numbers stay so; callers check
@@ -57,20 +53,6 @@ def float32_rounding(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
     sizes = np.asarray(gaussians.log_scales, np.float64).max(axis=1, initial=-np.inf)
     sizes = np.exp(np.minimum(sizes, 700.0))  # the exponential of more is infinite
     return np.divide(moved, sizes, out=np.where(moved > 0, np.inf, 0.0), where=sizes > 0)
-
-
-def transform_blocks(
-    gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
-) -> Iterator[tuple[slice, Gaussians]]:
-    """Transforms Gaussians in blocks of BLOCK_ROWS rows; memory-mapped columns need not fit into memory.
-
-    Yields:
-      The rows of each block, and its Gaussians (NumPy); without a similarity they are copied.
-    """
-    for first in range(0, gaussians.count, BLOCK_ROWS):
-        rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))
-        part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
-        yield rows, part if similarity is None else transform_gaussians(part, similarity)
 
 
 def _product_matrix(q: np.ndarray) -> np.ndarray:

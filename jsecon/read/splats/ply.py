@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -19,9 +20,11 @@ from jsecon.errors import InputError
 from jsecon.files import atomic_write, scratch_array
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
-from jsecon.splat.transform import BLOCK_ROWS, float32_rounding, transform_blocks
+from jsecon.splat.transform import float32_rounding, transform_gaussians
 from jsecon.types import Array, Gaussians
 
+BLOCK_ROWS = 1 << 18
+"""Number of Gaussians read or transformed at a time."""
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 """format of a .ply -> NumPy's byte order"""
 _TYPES = dict(char="i1", uchar="u1", short="i2", ushort="u2", int="i4", uint="u4", float="f4", double="f8")
@@ -198,7 +201,7 @@ def usable_blocks(
 
     The Gaussians may be memory-mapped. A Gaussian that cannot be drawn is an error: `load_gaussians` would refuse it.
     """
-    for rows, block in transform_blocks(gaussians, similarity):
+    for rows, block in _transform_blocks(gaussians, similarity):
         require_drawable(path, block, rows.start, "Remove these Gaussians first.")
         yield rows, block
 
@@ -244,6 +247,20 @@ def _header(count: int, properties: list[str]) -> bytes:
     return "\n".join([*start, *properties, "end_header\n"]).encode()
 
 
+def _transform_blocks(
+    gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
+) -> Iterator[tuple[slice, Gaussians]]:
+    """Transforms Gaussians in blocks of BLOCK_ROWS rows; memory-mapped columns need not fit into memory.
+
+    Yields:
+      The rows of each block, and its Gaussians (NumPy); without a similarity they are copied.
+    """
+    for first in range(0, gaussians.count, BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))
+        part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
+        yield rows, part if similarity is None else transform_gaussians(part, similarity)
+
+
 def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
     """Whether float32 would round centres by over 0.02 of the largest standard deviation of 1 in 100 Gaussians.
 
@@ -252,7 +269,7 @@ def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None =
     if similarity is None and gaussians.means.dtype != np.float64:
         return False
     bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
-    far = sum(int((float32_rounding(block) > 0.02).sum()) for _, block in transform_blocks(bare, similarity))
+    far = sum(int((float32_rounding(block) > 0.02).sum()) for _, block in _transform_blocks(bare, similarity))
     return far > 0.01 * gaussians.count
 
 
