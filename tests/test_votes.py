@@ -14,8 +14,9 @@ from jsecon.errors import InputError
 from jsecon.field import columns, evidence
 from jsecon.field.evidence import IGNORED, plan_evidence, region_votes, sum_evidence
 from jsecon.field.membership import normalise_votes
+from jsecon.splat import visible
 from jsecon.splat.render import render_rgb
-from jsecon.splat.visible import geometry_of_rows, render_in_blocks, visible_rows
+from jsecon.splat.visible import _padded_size, render_in_blocks, visible_part
 from jsecon.types import Regions, Votes
 
 REGIONS = 11
@@ -232,10 +233,11 @@ def test_normalised_on_disk_they_are_those_in_memory(scene, cameras, labels, tmp
     assert mapped.by_view is None
 
 
-def test_a_view_is_rendered_from_what_it_can_see():
+def test_a_view_is_rendered_from_what_it_can_see(monkeypatch):
     scene, cameras = ball(3_000, 1, 60, 40)
     scene.means[:1500, 0] += 50  # beside every view
-    ids = visible_rows(scene, cameras[0], rows=700)
+    monkeypatch.setattr(visible, "ROWS", 700)
+    ids, _ = visible_part(scene, cameras[0])
     assert 0 < len(ids) <= 1500
     assert (ids >= 1500).all()
     expected = render_rgb(scene, cameras[0]).features
@@ -245,7 +247,7 @@ def test_a_view_is_rendered_from_what_it_can_see():
     empty = dataclasses.replace(scene, means=away)
     np.testing.assert_array_equal(render_in_blocks(empty, cameras[0]), 0)
     counts = range(0, 300_000, 4_999)
-    sizes = [geometry_of_rows(scene, np.zeros(count, int)).count for count in counts]
+    sizes = [_padded_size(count) for count in counts]
     assert sizes == sorted(sizes)
     assert len(set(sizes)) < 40
     assert all(count <= size <= max(1.13 * count, count + 4096) for count, size in zip(counts, sizes))

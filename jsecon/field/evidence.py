@@ -39,7 +39,7 @@ from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
 from jsecon.splat.scan import CHUNK, blend_weights, make_batches, make_table, scan_tiles, to_tiles
-from jsecon.splat.visible import geometry_of_rows, visible_rows
+from jsecon.splat.visible import visible_part
 from jsecon.types import Array, Camera, Gaussians, Progress, Votes
 
 _RESOLUTION = 2.0**24
@@ -203,8 +203,7 @@ def plan_evidence(
         nothing, weightless = np.zeros(0, np.int32), np.zeros(0, np.float32)
         return lambda labels, num_regions: ViewEvidence(nothing, np.zeros(1, np.int32), nothing, weightless, weightless)
     if gaussians.count > MAX_WHOLE and capacity is None:
-        rows = visible_rows(gaussians, camera, near=near)
-        gaussians = geometry_of_rows(gaussians, rows)
+        rows, gaussians = visible_part(gaussians, camera, near=near)
         capacity = plan_capacity(gaussians, camera, margin=1.0, devices=1, near=near)
     plan = plan_view(gaussians, camera, capacity=capacity, near=near)
 

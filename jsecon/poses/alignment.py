@@ -190,7 +190,9 @@ def _residuals(level: _Level, poses: np.ndarray, pairs: np.ndarray, every: int =
     (a, b), cameras, subset = pairs.T, level.cameras, slice(None, None, every)
     motions = poses[b] @ np.linalg.inv(poses[a])
     moved = np.einsum("eij,esj->esi", motions[:, :3, :3], level.points[a, subset]) + motions[:, None, :3, 3]
-    fx, fy, cx, cy = (np.asarray(value, np.float64)[b][:, None] for value in _intrinsics(cameras))
+    fx, fy, cx, cy = (
+        np.asarray(value, np.float64)[b][:, None] for value in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)
+    )
     z = np.where(moved[..., 2] > 0, moved[..., 2], 1.0)
     u, v = fx * moved[..., 0] / z + cx, fy * moved[..., 1] / z + cy
     inside = (u > 1) & (v > 1) & (u < cameras.width - 1) & (v < cameras.height - 1) & (moved[..., 2] > 0)
@@ -207,10 +209,6 @@ def _residuals(level: _Level, poses: np.ndarray, pairs: np.ndarray, every: int =
     colour = grey - gains[:, None] * point_grey
     normals = planes / length[..., None]
     return _Residuals(colour, height / length, normals, motions[:, :3, :3], moved, np.stack([u, v], axis=-1), seen)
-
-
-def _intrinsics(cameras: Camera) -> tuple:
-    return cameras.fx, cameras.fy, cameras.cx, cameras.cy
 
 
 def _median_difference(level: _Level, poses: np.ndarray, pairs: np.ndarray) -> float:
@@ -245,7 +243,7 @@ def _step(
     q, seen = residuals.moved, residuals.seen
     u, v = np.moveaxis(residuals.pixels, -1, 0)
     slope_u, slope_v = (_bilinear(level.slopes[..., axis], b[:, None], u, v) for axis in (0, 1))
-    fx, fy = (np.asarray(value, np.float64)[b][:, None] for value in _intrinsics(level.cameras)[:2])
+    fx, fy = (np.asarray(value, np.float64)[b][:, None] for value in (level.cameras.fx, level.cameras.fy))
     z = np.where(seen, q[..., 2], 1.0)
     du, dv = slope_u * fx / z, slope_v * fy / z
     along = np.stack([du, dv, -(du * q[..., 0] + dv * q[..., 1]) / z], axis=-1)

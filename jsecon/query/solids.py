@@ -18,7 +18,7 @@ from jsecon.parallel import map_views
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.points import back_project
-from jsecon.splat.visible import geometry_of_rows, visible_rows
+from jsecon.splat.visible import visible_part
 from jsecon.types import Camera, Gaussians
 
 SHARE = 0.6
@@ -61,8 +61,7 @@ def surface_points(
     def view(t: int) -> list[tuple[int, np.ndarray]]:
         camera, own, part = jax.tree.map(np.asarray, cameras[t]), labels, gaussians
         if not whole:
-            rows = visible_rows(gaussians, camera)
-            part = geometry_of_rows(gaussians, rows)
+            rows, part = visible_part(gaussians, camera)
             own = np.pad(labels[rows], (0, part.count - len(rows)), constant_values=-1)
         plan, pose, found = plan_view(part, camera), np.asarray(camera.world_to_camera), []
         z = np.asarray(part.means) @ pose[2, :3] + pose[2, 3]

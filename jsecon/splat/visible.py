@@ -31,17 +31,28 @@ def hide(gaussians: Gaussians, mask: Bool[np.ndarray, " n"]) -> Gaussians:
     return dataclasses.replace(gaussians, opacity_logits=logits)
 
 
-def visible_rows(
-    gaussians: Gaussians, camera: Camera, *, near: float = NEAR, rows: int = ROWS
-) -> Int[np.ndarray, " m"]:
-    """Finds the ids (ascending) of the Gaussians that a view can see, reading `rows` at a time."""
+def visible_part(
+    gaussians: Gaussians, camera: Camera, *, near: float = NEAR, least: int = 0
+) -> tuple[Int[np.ndarray, " m"], Gaussians]:
+    """Finds the ids (ascending) of the Gaussians that a view can see, and reads their geometry, in black.
+
+    Transparent Gaussians follow, up to `_padded_size(M)`, or `least`.
+    """
     check_gaussians(gaussians, camera)
     geometry = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
-    ids = [np.zeros(0, np.int64)]
-    for first in range(0, gaussians.count, rows):
-        block = jax.tree.map(lambda a, first=first: np.asarray(a[first : first + rows], np.float32), geometry)
-        ids.append(first + np.flatnonzero(np.asarray(_is_visible(block, camera, near))))
-    return np.concatenate(ids)
+    blocks = [np.zeros(0, np.int64)]
+    for first in range(0, gaussians.count, ROWS):
+        block = jax.tree.map(lambda a, first=first: np.asarray(a[first : first + ROWS], np.float32), geometry)
+        blocks.append(first + np.flatnonzero(np.asarray(_is_visible(block, camera, near))))
+    ids = np.concatenate(blocks)
+    size = max(_padded_size(len(ids)), least)
+
+    def fill(a):
+        return np.zeros((size - len(ids), *a.shape[1:]), np.float32)
+
+    part = jax.tree.map(lambda a: np.concatenate([np.asarray(a[ids], np.float32), fill(a)]), geometry)
+    part.opacity_logits[len(ids) :] = -np.inf
+    return ids, dataclasses.replace(part, sh=np.zeros((size, 1, 3), np.float32))
 
 
 def points_in_view(cameras: Camera, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "t p"]:
@@ -66,33 +77,19 @@ def _padded_size(count: int) -> int:
     return max(-(-count // step), 1) * step
 
 
-def geometry_of_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"], least: int = 0) -> Gaussians:
-    """Reads the geometry of some Gaussians, in black, then transparent ones up to `_padded_size(M)`, or `least`."""
-    size = max(_padded_size(len(ids)), least)
-    bare = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
-
-    def fill(a):
-        return np.zeros((size - len(ids), *a.shape[1:]), np.float32)
-
-    part = jax.tree.map(lambda a: np.concatenate([np.asarray(a[ids], np.float32), fill(a)]), bare)
-    part.opacity_logits[len(ids) :] = -np.inf
-    return dataclasses.replace(part, sh=np.zeros((size, 1, 3), np.float32))
-
-
 def render_in_blocks(gaussians: Gaussians, camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """Renders the features of `render_rgb` of N finite Gaussians, many or in memory-mapped columns."""
     camera = jax.tree.map(np.asarray, camera)
-    ids = visible_rows(gaussians, camera)
-    colours = np.zeros((_padded_size(len(ids)), 3), np.float32)
+    ids, visible = visible_part(gaussians, camera)
+    colours = np.zeros((visible.count, 3), np.float32)
     for first in range(0, len(ids), ROWS):
         rows = ids[first : first + ROWS]
         part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
         colours[first : first + len(rows)] = _colours(part, camera)
     if not len(ids):
         return np.zeros((camera.height, camera.width, 3), np.float32)
-    part = geometry_of_rows(gaussians, ids)
-    capacity = plan_capacity(part, camera, margin=1.0, devices=1)  # of the default's room most would be empty
-    return np.asarray(render(part, camera, jnp.asarray(colours), capacity=capacity).features)
+    capacity = plan_capacity(visible, camera, margin=1.0, devices=1)  # of the default's room most would be empty
+    return np.asarray(render(visible, camera, jnp.asarray(colours), capacity=capacity).features)
 
 
 _colours = jax.jit(colours_from_sh)

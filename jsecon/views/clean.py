@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from jsecon.field.evidence import MAX_WHOLE, each_view, plan_evidence
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render_depth
-from jsecon.splat.visible import geometry_of_rows, hide, visible_rows
+from jsecon.splat.visible import hide, visible_part
 from jsecon.types import Camera, Gaussians, Progress
 
 KINDS = ("kept", "unseen", "faint", "haze", "floaters")
@@ -57,7 +57,7 @@ def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None
     if count <= MAX_WHOLE:  # once for all views
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
     else:
-        seen_by = functools.lru_cache(1)(functools.partial(_seen_by, gaussians, cameras))
+        seen_by = functools.lru_cache(1)(lambda t, views=cameras: visible_part(gaussians, views[t]))
         cameras = _divided(cameras, side)
     for n, (least, gap) in enumerate(((_FIRST_SHARE, _FIRST_GAP), (_SHARE, _GAP))):
         front, total, peak = np.zeros((3, count), np.float32)
@@ -107,21 +107,14 @@ def _divided(cameras: Camera, side: int) -> Camera:
     return dataclasses.replace(parts, width=part[0], height=part[1])
 
 
-def _seen_by(gaussians: Gaussians, cameras: Camera, t: int) -> tuple[np.ndarray, Gaussians]:
-    """Returns the Gaussians that a view can see: their rows, and their geometry in memory."""
-    rows = visible_rows(gaussians, cameras[t])
-    return rows, geometry_of_rows(gaussians, rows)
-
-
 def _part(
     rows: np.ndarray, whole: Gaussians, seen: np.ndarray, camera: Camera, gap: float, room: list[int]
 ) -> tuple[np.ndarray, ...]:
-    """Does what `_view` does of a part of a view, of those that this is `_seen_by`.
+    """Does what `_view` does of a part of a view, which this sees.
 
     `room` keeps the largest numbers of Gaussians and of their pairs, so that parts share programs.
     """
-    ids = visible_rows(whole, camera)
-    gaussians = geometry_of_rows(whole, ids, room[0])
+    ids, gaussians = visible_part(whole, camera, least=room[0])
     room[0] = gaussians.count
     room[1] = max(room[1], plan_capacity(gaussians, camera, margin=1.0, devices=1))
     inside, *columns = _view(gaussians, np.pad(seen[rows[ids]], (0, room[0] - len(ids))), camera, gap, room[1])
