@@ -5,7 +5,6 @@ from hypothesis import given, settings, strategies as st
 from mask_overlaps import iou_matrix
 
 from jsecon.vision.classical import ClassicalSegmenter
-from jsecon.vision.protocols import Segmenter
 from jsecon.vision.region_graph import merge_regions
 
 
@@ -64,7 +63,6 @@ def test_a_finer_layer_has_what_hardly_differs_from_what_it_lies_on():
 def test_the_same_frame_gives_the_same_masks_and_its_mirror_image_nearly_the_mirrored():
     frame, things = desk()
     segmenter = ClassicalSegmenter()
-    assert isinstance(segmenter, Segmenter)
     best, coarse = ClassicalSegmenter(max_regions=5)(frame, 0), ClassicalSegmenter(layers=(1.0,))(frame, 0)
     assert len(best) == 5 * len(segmenter.layers)
     np.testing.assert_array_equal(best[:5], coarse[:5])

@@ -13,7 +13,7 @@ from tokenizers import decoders
 from jsecon.networks.clip import ClipEmbedder, _masked_crop, read_preprocessing
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer
 from jsecon.vision.protocols import CANONICAL, Embedder
-from jsecon.vision.unrelated_words import UNRELATED_WORDS, cached_unrelated_words
+from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
 LAYOUTS = ("immich", "transformers.js")
 
@@ -112,13 +112,17 @@ def test_unrelated_words_are_embedded_once_for_a_model(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     asked = []
 
-    def embed_text(texts):
-        asked.append(len(texts))
-        return np.random.default_rng(0).standard_normal((len(texts), 5)).astype(np.float32)
+    class Words(ClipEmbedder):
+        def __init__(self, name):
+            self.name = name
 
-    first = cached_unrelated_words("model a", embed_text)
+        def embed_text(self, texts):
+            asked.append(len(texts))
+            return np.random.default_rng(0).standard_normal((len(texts), 5)).astype(np.float32)
+
+    first = Words("model a").unrelated_words
     for model, count in (("model a", 1), ("model a", 2), ("model b", 3)):
-        np.testing.assert_array_equal(cached_unrelated_words(model, embed_text), first)
+        np.testing.assert_array_equal(Words(model).unrelated_words, first)
         assert asked == [len(UNRELATED_WORDS)] * count
         for kept in tmp_path.rglob("*.safetensors"):
             kept.write_bytes(kept.read_bytes()[:-7])  # damaged: embedded anew

@@ -15,8 +15,8 @@ def test_one_component_is_seen_where_points_are_dense(monkeypatch):
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
     strayed = np.append(sphere, [[1.5, 0, 0]], 0)
     for points, clusters, kept in ((sphere, 1, 4_000), (strayed, 1, 4_000), (sphere[:20], 0, 20)):
-        found = split_outliers(points, np.ones(len(points), bool))
-        assert (found.clusters, found.mask.sum()) == (clusters, kept)
+        mask, number = split_outliers(points, np.ones(len(points), bool))
+        assert (number, mask.sum()) == (clusters, kept)
 
 
 def two_blobs_and_strays(scale=1.0):

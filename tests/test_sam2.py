@@ -12,7 +12,6 @@ from sam2_files import CHANNELS, MEAN, MEMORY, POINTERS, SIZE, SLOTS, STD, write
 
 from jsecon.networks.sam2 import HOLE_AREA, Sam2Tracker, _fill_holes, _open_sam2, follow
 from jsecon.networks.session import Graph
-from jsecon.vision.protocols import Tracker
 
 HEIGHT, WIDTH = 20, 28
 TOLERANCE = 0.01
@@ -143,7 +142,6 @@ def test_tracker_gives_each_pixel_to_the_highest_logit(folder):
     frames = a_clip(6)
     prompts = np.stack([a_mask(3, 4, 15, 13), np.zeros((HEIGHT, WIDTH), bool), a_mask(10, 6, 25, 18)])
     tracker = Sam2Tracker(folder)
-    assert isinstance(tracker, Tracker)
     labels = tracker(frames, 2, prompts)
     assert labels.shape == frames.shape[:3]
     assert labels.dtype == np.int16

@@ -5,7 +5,6 @@ from balls import HEIGHT, WIDTH, ious, ring_of_balls
 from jsecon.association import scene as association
 from jsecon.association.scene import superpixels
 from jsecon.paper.tracker import GeometricTracker
-from jsecon.vision.protocols import Tracker
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,6 @@ def prompts_at(truth, t):
 
 def test_follows_each_ball_around_the_ring(world, tracker):
     (_, _, frames, truth, _), start = world, 10
-    assert isinstance(tracker, Tracker)
     labels = tracker(frames, start, prompts_at(truth, start))
     np.testing.assert_array_equal(labels[start], truth[start] - 1)
     assert np.nanmin(ious(labels, truth, 3)) > 0.9

@@ -9,10 +9,9 @@ from small_field import KnownTexts, colour_field, make_field, unit_rows
 from jsecon import InputError, Regions, load_field, save_field
 from jsecon.app.records import Region
 from jsecon.app.scene import Scene
-from jsecon.field.tree import cut_field, part_objects
+from jsecon.field.tree import cut_field, node_members, part_objects
 from jsecon.query.expressions import split_part
-from jsecon.query.match import select_node
-from jsecon.query.parts import match_lone_parts
+from jsecon.query.parts import match_parts
 from jsecon.query.rules import ABSENT, FOUND, QueryRules
 from jsecon.vision.colours import ColourEmbedder
 
@@ -104,11 +103,11 @@ def test_which_texts_name_a_part(text, named):
 def test_a_text_names_a_part_of_a_thing(scene_of_parts, field):
     for text, node in (("the handle of the mug", 9), ("rim of the mug", 8), ("the mug's rim", 8)):
         answer = scene_of_parts.ask(text)
-        np.testing.assert_array_equal(answer.mask, select_node(field, node).mask)
+        np.testing.assert_array_equal(answer.mask, node_members(field.tree, field.leaf, node))
         assert answer.state == "found"
         assert answer.objects[0].regions == (node,)
     for text, node in (("handle", 9), ("rim", 8)):  # of any thing, as no thing is called so
-        np.testing.assert_array_equal(scene_of_parts.ask(text).mask, select_node(field, node).mask)
+        np.testing.assert_array_equal(scene_of_parts.ask(text).mask, node_members(field.tree, field.leaf, node))
     assert int(scene_of_parts.ask("mug").selection.region) == 0
     assert scene_of_parts.ask("lid").state != "found"
     assert scene_of_parts.ask("handle or rim").by == "votes"
@@ -123,7 +122,7 @@ def test_a_thing_that_a_text_may_name_stands_before_the_part_that_is_most_of_it(
     """ "Teddy" may match body and head for certain and the teddy hardly: it is the teddy still. "Ear" is the ear."""
     most, little = unit_rows(np.random.default_rng(3), len(TEXTS), 32)[5:7, None]  # three quarters of region 0; one
     for text, region, nodes in ((most, -1, [9]), (most, 1, [9]), (most, 0, []), (little, 0, [8])):
-        found, state = match_lone_parts(field, text, region, QueryRules())
+        found, state = match_parts(field, text, QueryRules(), unless=region)
         assert found.tolist() == nodes
         assert state == (FOUND if nodes else ABSENT)
 

@@ -25,7 +25,7 @@ from jsecon.app.records import Query, Region
 from jsecon.app.scene import Scene
 from jsecon.app.server import listen, page_application
 from jsecon.app.viewer.view import _view
-from jsecon.change.history import move_object
+from jsecon.change.history import change_object
 from jsecon.pipeline.progress import Console
 from jsecon.vision.colours import BASIC, ColourEmbedder
 
@@ -39,7 +39,7 @@ def asked(scene, cameras):
     leaf = main_regions(field).astype(np.int32)
     field = dataclasses.replace(field, tree=TREE, leaf=leaf, metres_per_unit=0.5)
     mask, event = np.arange(64) < 9, {"kind": "moved", "name": "ball", "date": "2026-11-02", "region": 0}
-    return Scene(move_object(field, mask, np.eye(4), event), ColourEmbedder(), name="<desk>")
+    return Scene(change_object(field, mask, event, motion=np.eye(4)), ColourEmbedder(), name="<desk>")
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from jsecon.field.columns import vote_blocks
 from jsecon.field.membership import SHARE_THRESHOLD, ratio, vote_columns, vote_shares
 from jsecon.programs import stored_jit
 from jsecon.query.answer import match_region
-from jsecon.query.match import MIN_FRAGMENT_OVERLAP, compare_words, score_text, unrelated_words
+from jsecon.query.match import MIN_FRAGMENT_OVERLAP, compare_words, score_text
 from jsecon.query.object_shapes import ObjectShapes, gaussian_spreads, object_shapes
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.rules import ABSENT, RULES, QueryRules
@@ -172,7 +172,7 @@ def objects(
     weighted = pixels.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64)
     present = np.zeros(len(texts), bool)
     if len(members):
-        regions, words = jax.tree.map(np.asarray, (field.regions, unrelated_words(field)))
+        regions, words = jax.tree.map(np.asarray, (field.regions, field.unrelated_words))
         with np.errstate(invalid="ignore"):  # as a query does, without a program
             words = compare_words(regions.embeddings, words, RULES.retrieval)
             scores = [score_text(regions.embeddings, row, regions.pixel_counts, words, RULES) for row in embeddings]

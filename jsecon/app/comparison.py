@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from jsecon.app.catalogue import Catalogue
 from jsecon.app.records import rounded, source_points
 from jsecon.change.detect import Change
-from jsecon.change.history import add_objects, dates, move_object, remove_object
+from jsecon.change.history import add_objects, change_object, dates
 from jsecon.errors import InputError
 from jsecon.field.evidence import ViewEvidence, pack_evidence
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
@@ -87,11 +87,12 @@ def apply_changes(
     for change, record in zip(changes.found, changes.records()):
         mask, description = (listed.labels == change.object) & (change.object >= 0), record | {"date": date}
         if change.kind == "moved":
-            field = move_object(field, mask, change.motion, description)
+            field = change_object(field, mask, description, motion=change.motion)
         elif change.kind == "gone":
-            field = remove_object(field, mask, np.flatnonzero(listed.regions == change.object).tolist(), description)
+            regions = np.flatnonzero(listed.regions == change.object).tolist()
+            field = change_object(field, mask, description, regions=regions)
         elif change.kind == "look":
-            field = remove_object(field, mask & False, (), description)
+            field = change_object(field, mask & False, description)
         elif change.kind == "new":
             descriptions.append(description)
     things, masks = new_things(changes, field.cameras)

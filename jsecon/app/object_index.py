@@ -20,13 +20,13 @@ from jsecon.app.records import Answer, Object, Query, rounded, source_shapes
 from jsecon.errors import InputError
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction_of_regions
-from jsecon.field.tree import part_objects
+from jsecon.field.tree import node_members, part_objects
 from jsecon.query.answer import match_regions
 from jsecon.query.expressions import ANY_OBJECT, parse_expression, split_part
-from jsecon.query.match import RegionMatch, select_node
+from jsecon.query.match import RegionMatch
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.parts import match_lone_parts, match_parts
+from jsecon.query.parts import match_parts
 from jsecon.query.pointing import frame_index
 from jsecon.query.referring import evaluate, with_everything
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
@@ -110,7 +110,7 @@ class ObjectIndex:
         match = match_regions(self._field, embedded, self._rules)
         if int(match.state) < FOUND:  # no thing has that name; parts of things may
             unsure = int(match.region) if int(match.state) > ABSENT else -1
-            nodes, state = match_lone_parts(self._field, embedded, unsure, self._rules)
+            nodes, state = match_parts(self._field, embedded, self._rules, unless=unsure)
             if len(nodes):
                 return [self._part(phrase, int(node), state) for node in nodes]
         regions = np.flatnonzero(np.asarray(match.chosen)) if int(match.region) >= 0 else np.zeros(0, int)
@@ -137,13 +137,13 @@ class ObjectIndex:
         for one in wholes:
             nodes, state = np.asarray(field.part_nodes)[np.isin(part_objects(field), one.regions)], one.state
             if texts is not None:
-                nodes, state = match_parts(field, texts, one.regions, self._rules)
+                nodes, state = match_parts(field, texts, self._rules, one.regions)
             found += [self._part(f"{part} of {one.phrase}", int(node), state) for node in nodes]
         return [one for one in found if len(one.rows)]
 
     def _part(self, phrase: str, node: int, state: int) -> Object:
         """A part of an object as an object of its own."""
-        rows = np.flatnonzero(select_node(self._field, node).mask)
+        rows = np.flatnonzero(node_members(np.asarray(self._field.tree), np.asarray(self._field.leaf), node))
         shape = source_shapes(self._field, rows, np.zeros(len(rows), int), self._catalogue.up)
         return Object(phrase, (node,), rows, shape, state=state)
 

@@ -25,7 +25,7 @@ from jsecon.app.object_index import ObjectIndex, choose_shades
 from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Box, Mask, Query, Question, Region, gaussian_rows
 from jsecon.change.detect import object_changes
-from jsecon.change.history import add_unseen, change_question, events, field_as_of
+from jsecon.change.history import add_unseen, events, field_as_of
 from jsecon.errors import InputError
 from jsecon.field.columns import is_mapped
 from jsecon.field.field import check_field, load_field
@@ -44,9 +44,8 @@ from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query, split_part
 from jsecon.query.object_shapes import ObjectShapes
-from jsecon.query.outliers import OutlierResult
-from jsecon.query.parts import match_lone_parts
-from jsecon.query.pointing import box_mask, frame_index, lift, region_at
+from jsecon.query.parts import match_parts
+from jsecon.query.pointing import OUTSIDE, UNKNOWN, frame_index, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
 from jsecon.read.captures.frames import move_capture, take_frames
@@ -58,6 +57,8 @@ from jsecon.splat.visible import points_in_view
 from jsecon.types import Capture, Gaussians, LanguageField, Selection
 from jsecon.views.frame import field_up
 
+_CHANGE_QUESTIONS = {"what moved": "moved", "what is gone": "gone", "what is new": "new", "what changed": ""}
+"""Question -> kind of event that it asks for, "" for any."""
 CACHED_BYTES = 1 << 28
 """bytes of the answers that a scene keeps, of five bytes a Gaussian each"""
 
@@ -369,7 +370,8 @@ class Scene:
         if query.by == "code" and self.field.codes is None:
             raise InputError("", "This field has no codes", remedy="Run jsecon run --paper, or ask by votes.")
         if isinstance(question, str):
-            if (kind := change_question(question)) is not None:
+            plain = question.lower().strip(" ?").replace("what's", "what is").replace("what has", "what")
+            if (kind := _CHANGE_QUESTIONS.get(plain)) is not None:
                 return self._answer_history(query, kind)
             is_related = is_expression(question) or self._names_part(question)
             answer = None if is_related else self._answer_text(query)
@@ -406,7 +408,7 @@ class Scene:
             return False
         unsure = int(answer.selection.region) if answer.state == STATES[UNSURE] else -1
         embedded = np.asarray(self.embedder.embed_text(texts))
-        return len(match_lone_parts(self.field, embedded, unsure, QueryRules())[0]) > 0
+        return len(match_parts(self.field, embedded, QueryRules(), unless=unsure)[0]) > 0
 
     def _answer_text(self, query: Query) -> Answer:
         """Selects the Gaussians that a text names."""
@@ -421,7 +423,7 @@ class Scene:
         embedded = embedder.embed_text(included + excluded)
         texts, without = embedded[: len(included)], embedded[len(included) :]
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
-        warnings = [] if found[1].mask.any() else run_warnings(field)
+        warnings = [] if found[1].any() else run_warnings(field)
         reason = " ".join(["no region matches it; the run warned:", *warnings]).rstrip(".") if warnings else ""
         return self._finish(query, found, reason)
 
@@ -463,25 +465,34 @@ class Scene:
     def _answer_outline(self, query: Query, question: Box | Mask) -> Answer:
         """Selects the object that a box or masks outline in frames."""
         self._require_memory("an outline")
-        ends = [] if isinstance(question, Mask) else [question.x0, question.y0, question.x1, question.y1]
-        frames = question.frames if isinstance(question, Mask) else {question.frame: box_mask(self.field, *ends)}
+        frames = question.frames if isinstance(question, Mask) else {question.frame: self._box_mask(question)}
         given = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
         masks = np.stack([np.asarray(mask, int) for mask in given.values()])
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
         selection = lift(self.field, masks, list(given), threshold=threshold)
-        outliers = trim(self.field, selection, "supported" if query.outliers else None)
-        return self._finish(query, (selection, outliers, 1))
+        mask, _ = trim(self.field, selection, "supported" if query.outliers else None)
+        return self._finish(query, (selection, mask, 1))
 
-    def _finish(self, query: Query, found: tuple[Selection, OutlierResult, int], reason: str = "") -> Answer:
+    def _box_mask(self, box: Box) -> np.ndarray:
+        """Makes the mask of a box: OUTSIDE, and UNKNOWN from its first column and row to its last ones."""
+        mask = np.full((self.field.cameras.height, self.field.cameras.width), OUTSIDE)
+        mask[max(box.y0, 0) : max(box.y1 + 1, 0), max(box.x0, 0) : max(box.x1 + 1, 0)] = UNKNOWN
+        if not mask.any():
+            problem = f"{box.x0} {box.y0} {box.x1} {box.y1} has no pixels of a frame of {mask.shape[1]}x{mask.shape[0]}"
+            remedy = "Give its left, upper, right and lower end, in the frames as the run used them."
+            raise InputError("box", problem, remedy=remedy)
+        return mask
+
+    def _finish(self, query: Query, found: tuple[Selection, np.ndarray, int], reason: str = "") -> Answer:
         """The answer of a query whose Gaussians were selected and trimmed: these, and the number of objects."""
-        selection, outliers, count = found
+        selection, mask, count = found
         return Answer(
             query,
             "outline" if isinstance(query.question, Box | Mask) else query.by,
-            outliers.mask,
+            mask,
             jax.tree.map(np.asarray, selection),
             self.field,
-            count=count if outliers.mask.any() else 0,
+            count=count if mask.any() else 0,
             reason=reason,
         )
 

@@ -18,14 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, Int32, Integer, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import (
-    FrameSuperpixels,
-    SceneSuperpixels,
-    Sparse,
-    assign_superpixels,
-    one_hot,
-    sum_entries,
-)
+from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, Sparse, assign_superpixels, one_hot
 from jsecon.errors import require
 from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential
@@ -546,5 +539,9 @@ def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse,
         shares.append((share, view.seen[cast.row[keep]], start + cast.col[keep]))
         looks.append((visibility.astype(np.float32), view.seen, np.full(len(view.seen), t)))
         start += len(view.proposals)
-    membership, visible = sum_entries(shares, (count, start)), sum_entries(looks, (count, len(views)))
+    matrices = []
+    for entries, width in ((shares, start), (looks, len(views))):
+        values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
+        matrices.append(sparse.csr_matrix((values, (rows, columns)), shape=(count, width)))
+    membership, visible = matrices
     return membership, visible, (weights / max(len(views), 1)).astype(np.float32)

@@ -256,12 +256,6 @@ def superpixel_coverage(
     return (np.asarray(inside, np.float32).reshape(len(masks), count) / np.maximum(area, 1)).astype(np.float32)
 
 
-def sum_entries(entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]) -> Sparse:
-    """Builds a sparse matrix of parts of values, rows and columns; repeated entries are added up."""
-    values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
-    return sparse.csr_matrix((values, (rows, columns)), shape=shape)
-
-
 def one_hot(labels: Int[np.ndarray, " a"], count: int) -> Sparse:
     """Encodes labels, -1 for none, as a sparse matrix (A, `count`) of float32 ones."""
     rows = np.flatnonzero(labels >= 0)

@@ -4,7 +4,10 @@ An object whose pixels the scene does not explain in any frame that sees it is d
 displaced objects is compared again: what it leaves unexplained, coherent over the frames, is where something new
 stands. Each displaced object is placed there, turned and shifted until its rendering explains most; if it explains
 enough, it moved. Else it is gone where the scene without it explains the photographs, and what is left is new. An
-object that too few pixels see keeps its state: it is not seen, never gone. NumPy arrays in and out.
+object that too few pixels see keeps its state: it is not seen, never gone.
+
+Photographs are compared in the colours of the scene: `_fit_exposure` brings them there. A pixel may be lighter or
+darker by a factor, at a small cost, because light and shadows change what nothing moved. NumPy arrays in and out.
 """
 
 import dataclasses
@@ -15,10 +18,9 @@ from typing import NamedTuple
 import cv2
 import jax
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from jsecon.change.compare import colour_cost, depth_cost, find_shift, fit_exposure, shifted
 from jsecon.errors import InputError, require_shape
 from jsecon.numerics import axes_across
 from jsecon.splat.points import back_project
@@ -51,6 +53,12 @@ MIN_MOVE = 0.2
 """Shift, as a share of its size, or turn, radians, from which an object has moved."""
 MIN_PROBABILITY = 0.5
 """Probability of what became of an object below which it is "unsure": neither reported nor applied as a change."""
+_COLOUR_STEP = 22.0
+"""CIELAB distance from which a pixel is not explained at all; half of it decides."""
+_LIGHT_STEP = 40.0
+"""CIELAB distance that a factor of e in lightness is worth."""
+_DEPTH_STEP = 0.03
+"""Difference of depth from which a pixel is not explained, as a share of the depth; a third of it is noise."""
 _KNOWN = 0.8
 """Alpha from which a rendering tells what a pixel shows."""
 _SUBPIXEL = 16
@@ -104,9 +112,9 @@ class _View(NamedTuple):
 
     def compare(self, rgb: np.ndarray, alpha: np.ndarray, z: np.ndarray, window=np.s_[:, :]) -> np.ndarray:
         """The cost of a rendering inside a window."""
-        cost = colour_cost(self.photo[window], rgb)
+        cost = _colour_cost(self.photo[window], rgb)
         if self.depth is not None:
-            apart = depth_cost(self.depth[window], z)
+            apart = _depth_cost(self.depth[window], z)
             cost = np.where(np.isnan(apart), cost, np.maximum(0.6 * cost, np.abs(apart)))
         return np.where(alpha >= _KNOWN, cost, np.nan)
 
@@ -170,6 +178,83 @@ class _Body:
         return window, rgb, depth
 
 
+def _fit_exposure(
+    photo: Float32[np.ndarray, "h w 3"], render: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """Brings a photograph to the colours of a rendering by a gain and an offset of each channel.
+
+    The fit weighs pixels by how well they agree (Cauchy), so that what changed does not count.
+    """
+    known = known & (photo > 0.01).all(-1) & (photo < 0.99).all(-1)
+    if known.sum() < 64:
+        return photo
+    source, target = photo[known].astype(np.float64), render[known].astype(np.float64)
+    gain, offset = np.median(target, 0) / np.maximum(np.median(source, 0), 1e-3), np.zeros(3)
+    for _ in range(12):
+        error = source * gain + offset - target
+        weight = 1 / (1 + (error**2).sum(1) / 0.04**2)
+        mean, middle = (np.average(values, axis=0, weights=weight) for values in (source, target))
+        spread = np.average((source - mean) ** 2, axis=0, weights=weight)
+        both = np.average((source - mean) * (target - middle), axis=0, weights=weight)
+        gain = np.clip((both + 1e-4 * gain) / (spread + 1e-4), 0.2, 5.0)
+        offset = middle - gain * mean
+    return np.clip(photo * gain + offset, 0, 1.5).astype(np.float32)
+
+
+def _find_shift(
+    photo: Float32[np.ndarray, "h w 3"], render: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
+) -> tuple[int, int]:
+    """Finds by how many rows and columns a photograph lies off the rendering of its pose, from edges of lightness."""
+
+    def edges(image):
+        grey = cv2.GaussianBlur(image.mean(-1), (0, 0), 1.0)
+        return np.minimum(np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)), 0.5)
+
+    reach = max(round(0.025 * photo.shape[1]), 1)  # px; errors of poses are smaller
+    around = cv2.copyMakeBorder(edges(photo), reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+    errors = cv2.matchTemplate(around, edges(render), cv2.TM_SQDIFF, mask=known.astype(np.float32))
+    row, column = np.unravel_index(errors.argmin(), errors.shape)
+    return reach - int(row), reach - int(column)
+
+
+def _shifted(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
+    """Moves an image by (rows, columns), px; its edge is repeated."""
+    (down, across), size = shift, image.shape[1::-1]
+    motion = np.array([[1.0, 0, across], [0, 1, down]])
+    return cv2.warpAffine(image, motion, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _shifts(image: np.ndarray) -> list[np.ndarray]:
+    """An image moved by up to one px each way."""
+    return [_shifted(image, (y, x)) for y in (1, 0, -1) for x in (1, 0, -1)]
+
+
+def _colour_cost(
+    photo: Float32[np.ndarray, "h w 3"], render: Float32[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "h w"]:
+    """How little a rendering explains the colours of a photograph, 0 to 1: least over shifts of up to one px."""
+    best = np.full(photo.shape[:2], np.inf, np.float32)
+    lab = cv2.cvtColor(np.clip(photo, 0, 1), cv2.COLOR_RGB2LAB)
+    for moved in _shifts(render):
+        gain = (np.einsum("hwc,hwc->hw", photo, moved) + 1e-3) / (np.einsum("hwc,hwc->hw", moved, moved) + 1e-3)
+        gain = np.clip(gain, 0.4, 2.5).astype(np.float32)
+        apart = lab - cv2.cvtColor(np.clip(moved * gain[..., None], 0, 1), cv2.COLOR_RGB2LAB)
+        best = np.minimum(best, np.einsum("hwc,hwc->hw", apart, apart) + (_LIGHT_STEP * np.log(gain)) ** 2)
+    return np.minimum(np.sqrt(best) / _COLOUR_STEP, 1.0)
+
+
+def _depth_cost(depth: Float[np.ndarray, "h w"], rendered: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """How little rendered depth explains a measured one, -1 to 1: negative where the measured surface is nearer.
+
+    It is that of least size over shifts of up to one px; NaN where either is unknown (0).
+    """
+    known, best = (depth > 0) & (rendered > 0), np.full(depth.shape, np.inf)
+    for moved in _shifts(rendered):
+        difference = np.where(moved > 0, (depth - moved) / (_DEPTH_STEP * np.maximum(moved, 1e-9)), np.inf)
+        best = np.where(np.abs(difference) < np.abs(best), difference, best)
+    return np.where(known, np.sign(best) * np.clip(1.5 * np.abs(best) - 0.5, 0, 1), np.nan)
+
+
 def _render(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Renders colour (clamped), alpha and z-depth."""
     image = render_rgb(gaussians, camera, depth=True)
@@ -180,10 +265,10 @@ def _first_view(gaussians: Gaussians, camera: Camera, frame: np.ndarray, depth: 
     """Renders a frame, and aligns the photograph and its exposure to that."""
     image = _render(gaussians, camera)
     photo, known = frame.astype(np.float32) / 255, image[1] >= _KNOWN
-    shift = find_shift(photo, image[0], known)
-    photo = fit_exposure(shifted(photo, shift), image[0], known)
+    shift = _find_shift(photo, image[0], known)
+    photo = _fit_exposure(_shifted(photo, shift), image[0], known)
     if depth is not None:
-        depth = shifted(np.asarray(depth, np.float32), shift)
+        depth = _shifted(np.asarray(depth, np.float32), shift)
         depth = np.where(depth > 0, cv2.medianBlur(depth, 3), 0)  # a third of the noise
     view = _View(camera, photo, depth, *image, image[1])
     return view._replace(cost=view.compare(*image))
@@ -273,11 +358,6 @@ class _Cluster(NamedTuple):
     radius: float
     """Radius of the largest disc in a mask, px."""
 
-    def join(self, other: "_Cluster") -> "_Cluster":
-        """Joins the pixels of one more frame; the size stays that of the first, which has most pixels."""
-        place = (len(self.masks) * self.place + other.place) / (len(self.masks) + 1)
-        return _Cluster(place, self.size, self.masks | other.masks, max(self.radius, other.radius))
-
     def inside(self, silhouettes: np.ndarray) -> float:
         """The share of its pixels in silhouettes (F, H, W), two pixels wider: what a thing there left bare."""
         wider = {t: cv2.dilate(silhouettes[t].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for t in self.masks}
@@ -313,7 +393,7 @@ class _Search:
         for view, owners in zip(self.first, self.owners):
             known = (owners >= 0) & ~np.isnan(view.cost)
             if view.depth is not None:
-                known &= ~(depth_cost(view.depth, view.z) < -0.5)
+                known &= ~(_depth_cost(view.depth, view.z) < -0.5)
             columns.append([np.bincount(owners[mask], minlength=count) for mask in (known, known & (view.cost > 0.5))])
         known, differing = np.array(columns).transpose(1, 2, 0)
         return known, differing
@@ -350,7 +430,9 @@ class _Search:
             for n, group in enumerate(groups):
                 near = np.linalg.norm(group.place - part.place) < 0.75 * max(part.size, group.size)
                 if near and not group.masks.keys() & part.masks.keys():
-                    groups[n] = group.join(part)
+                    place = (len(group.masks) * group.place + part.place) / (len(group.masks) + 1)
+                    # The size stays that of the first frame, which has most pixels.
+                    groups[n] = _Cluster(place, group.size, group.masks | part.masks, max(group.radius, part.radius))
                     break
             else:
                 groups.append(part)
@@ -364,7 +446,7 @@ class _Search:
         number, image, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
         down = -(np.asarray(view.camera.world_to_camera, np.float64)[:3, :3] @ self.up)[:2]
         height, width = mask.shape
-        bare = np.zeros(mask.shape, bool) if view.depth is None else depth_cost(view.depth, view.z) > 0.3
+        bare = np.zeros(mask.shape, bool) if view.depth is None else _depth_cost(view.depth, view.z) > 0.3
         result = []
         for n in range(1, number):
             left, top, across, tall, area = stats[n]

@@ -22,13 +22,6 @@ from jsecon.splat.transform import transform_gaussians
 from jsecon.splat.visible import HIDDEN_LOGIT
 from jsecon.types import Event, Gaussians, LanguageField
 
-_QUESTIONS = {"what moved": "moved", "what is gone": "gone", "what is new": "new", "what changed": ""}
-
-
-def change_question(text: str) -> str | None:
-    """The kind of event that a question such as "what moved" asks for, "" for any; None for another text."""
-    return _QUESTIONS.get(text.lower().strip(" ?").replace("what's", "what is").replace("what has", "what"))
-
 
 def _patched(field: LanguageField, event: Event) -> LanguageField:
     """Puts the columns of an event into a field."""
@@ -65,26 +58,22 @@ def _absent(event: Event) -> Event:
     return dataclasses.replace(event, gaussians=hidden, views=views, embeddings=embeddings)
 
 
-def _with_event(field: LanguageField, event: Event) -> LanguageField:
-    return dataclasses.replace(field, history=(*field.history, event))
-
-
-def move_object(
-    field: LanguageField, mask: Bool[np.ndarray, " n"], motion: Float[np.ndarray, "4 4"], description: dict[str, Any]
+def change_object(
+    field: LanguageField,
+    mask: Bool[np.ndarray, " n"],
+    description: dict[str, Any],
+    *,
+    motion: Float[np.ndarray, "4 4"] | None = None,
+    regions: Sequence[int] = (),
 ) -> LanguageField:
-    """Moves Gaussians rigidly, in the field's world."""
-    event = _event(field, np.flatnonzero(mask), np.zeros(0, int), description)
-    moved = transform_gaussians(event.gaussians, motion)
-    moved = jax.tree.map(lambda a, b: np.asarray(a, b.dtype), moved, event.gaussians)
-    return _with_event(_patched(field, dataclasses.replace(event, gaussians=moved)), event)
-
-
-def remove_object(
-    field: LanguageField, mask: Bool[np.ndarray, " n"], regions: Sequence[int], description: dict[str, Any]
-) -> LanguageField:
-    """Makes Gaussians and regions absent. The history keeps them."""
+    """Moves Gaussians rigidly, in the field's world, or makes them and regions absent. The history keeps them."""
     event = _event(field, np.flatnonzero(mask), np.asarray(regions, int), description)
-    return _with_event(_patched(field, _absent(event)), event)
+    now = _absent(event)
+    if motion is not None:
+        moved = transform_gaussians(event.gaussians, motion)
+        moved = jax.tree.map(lambda a, b: np.asarray(a, b.dtype), moved, event.gaussians)
+        now = dataclasses.replace(event, gaussians=moved)
+    return dataclasses.replace(_patched(field, now), history=(*field.history, event))
 
 
 def add_unseen(field: LanguageField, things: Sequence[Gaussians]) -> LanguageField:
@@ -117,7 +106,7 @@ def add_objects(
         rows = np.arange(first, first + thing.count)
         first += thing.count
         event = _event(field, rows, np.array([number]), description | {"region": number})
-        field = _with_event(field, _absent(event))
+        field = dataclasses.replace(field, history=(*field.history, _absent(event)))
     return field, ledger
 
 

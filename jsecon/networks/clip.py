@@ -8,6 +8,8 @@ it is.
 """
 
 import functools
+import hashlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,8 +23,10 @@ from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, Tensor, content_digest
 from jsecon.networks.tokenizer import CLIP_LENGTH, TextTokenizer, read_text_rules
 from jsecon.numerics import is_finite_and_bounded
+from jsecon.process import cache_home
 from jsecon.vision.protocols import CANONICAL
-from jsecon.vision.unrelated_words import cached_unrelated_words
+from jsecon.vision.stores import stored_array
+from jsecon.vision.unrelated_words import UNRELATED_WORDS
 
 
 def read_preprocessing(path: Path) -> tuple[tuple[float, ...], tuple[float, ...], int | None]:
@@ -109,8 +113,12 @@ class ClipEmbedder:
 
     @functools.cached_property
     def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
-        """(W, E) unit embeddings of the unrelated words; they are cached."""
-        return cached_unrelated_words(self.name, self.embed_text)
+        """(W, E) unit embeddings of UNRELATED_WORDS; the user's cache folder keeps them for each model."""
+        home, words = cache_home(os.environ), list(UNRELATED_WORDS)
+        if home is None:
+            return self.embed_text(words)
+        digest = hashlib.blake2b(repr((self.name, UNRELATED_WORDS)).encode(), digest_size=12).hexdigest()
+        return stored_array(home / "jsecon" / f"words-{digest}.safetensors", lambda: self.embed_text(words))
 
     @property
     def _side(self) -> int:

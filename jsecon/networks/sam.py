@@ -17,6 +17,7 @@ decoder take 42 ms each on two cores, one alone 34 ms. There are two kinds, whic
 """
 
 import functools
+import hashlib
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,7 +33,7 @@ from jsecon.networks.hub import find_files
 from jsecon.networks.session import Graph, content_digest
 from jsecon.process import VIEWS_AT_ONCE, cores
 from jsecon.vision.classical import ClassicalSegmenter
-from jsecon.vision.stores import stored_masks
+from jsecon.vision.stores import stored_array
 
 _BOX_IOU = 0.7
 """boxes with a higher IoU repeat each other; this and the thresholds in the code are LangSplat's (preprocess.py)"""
@@ -209,7 +210,8 @@ class SamSegmenter:
     Args:
       folder: The model folder.
       level: Level of the masks.
-      store: Folder that keeps the masks of frames, so that a stopped run goes on; None keeps none.
+      store: Folder that keeps the masks of frames, so that a stopped run goes on; None keeps none. It has a file of the
+        bits (M, ceil(H W / 8)) uint8, <digest of model, settings and frame>.safetensors, for each frame.
 
     Attributes:
       name: Follows from the content of the files and the level.
@@ -232,7 +234,12 @@ class SamSegmenter:
         """Returns the masks (M, H, W) of a frame, best score first; they may overlap."""
         if self._store is None:
             return self._segment(frame)[0]
-        return stored_masks(self._store, self.name, frame, lambda: self._segment(frame)[0])
+        height, width = frame.shape[:2]
+        digest = hashlib.blake2b(f"{self.name} {frame.shape}".encode(), digest_size=16)
+        digest.update(np.ascontiguousarray(frame).data)
+        path = self._store / f"{digest.hexdigest()}.safetensors"
+        bits = stored_array(path, lambda: np.packbits(self._segment(frame)[0].reshape(-1, height * width), axis=1))
+        return np.unpackbits(bits, axis=1, count=height * width).reshape(-1, height, width).astype(bool)
 
     def _segment(
         self, frame: UInt8[np.ndarray, "h w 3"]

@@ -47,7 +47,7 @@ def _is_named(
     masks: Float[np.ndarray, "m e"], texts: Float[np.ndarray, "q e"], words: Float[np.ndarray, "w e"]
 ) -> Bool[np.ndarray, " m"]:
     """Tells which masks show what one of Q texts names: only synonyms among the unrelated words match better."""
-    others = compare_words(masks, words if len(words) else None, RULES.retrieval)
+    others = compare_words(masks, words, RULES.retrieval)
     if others is None:
         raise InputError("--ignore", "the embedder knows no unrelated words to compare with", remedy="Take another.")
     best = np.max([region_similarities(masks, text, words, RULES.retrieval)[0] for text in texts], axis=0)

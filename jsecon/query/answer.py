@@ -14,45 +14,26 @@ All but `trim` and `answer_question` can be traced: jit them, or vmap them over 
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import sparse  # loads csgraph on its first use
 
 from jsecon.errors import require
 from jsecon.field.columns import is_mapped
 from jsecon.field.membership import inside_fraction, inside_fraction_of_regions
 from jsecon.field.similarity import Number, similarities
+from jsecon.field.tree import node_members
 from jsecon.numerics import array_module, is_traced
 from jsecon.paper.queries import select_by_code
 from jsecon.programs import stored_jit
-from jsecon.query.match import (
-    MIN_FRAGMENT_OVERLAP,
-    NO_REGIONS,
-    RegionMatch,
-    compare_words,
-    regions_with,
-    score_text,
-    select_node,
-    unrelated_words,
-)
-from jsecon.query.outliers import OutlierResult, split_outliers
+from jsecon.query.match import MIN_FRAGMENT_OVERLAP, NO_REGIONS, RegionMatch, compare_words, regions_with, score_text
+from jsecon.query.outliers import split_outliers
 from jsecon.query.rules import ABSENT, ALL_OF_CLASS, ONE_REGION, RULES, QueryRules
 from jsecon.types import Array, LanguageField, Selection, Votes
-
-
-class _Answered(NamedTuple):
-    """The answer to a question."""
-
-    selection: Selection
-    """The Gaussians of the regions that match."""
-    outliers: OutlierResult
-    """The mask of the selection without outliers, and the number of its clusters."""
-    objects: int
-    """Number of separate objects: groups of regions that overlap, at most as many as there are clusters."""
 
 
 def answer_question(
@@ -62,29 +43,37 @@ def answer_question(
     *,
     excluded: Float[Array, "u e"] | None = None,
     outliers: bool = True,
-) -> _Answered:
+) -> tuple[Selection, Bool[np.ndarray, " n"], int]:
     """Answers a question by the path of this page. Host code.
 
     `query` has the embeddings of one text or several, or is the id of a region that stands in place of a text, or of a
     node of `LanguageField.tree` for the Gaussians under it.
     `outliers` drops the Gaussians that lie apart; regions of the `excluded` texts are left out.
+
+    Returns:
+      The Gaussians of the regions that match, their mask without outliers, and the number of separate objects: groups
+      of regions that overlap, at most as many as there are clusters.
     """
-    node, several = None, False
+    is_node = False
     if isinstance(query, int | np.integer):
         match = match_region(field, query, rules)
-        if field.tree is not None and field.regions.count <= query < len(field.tree):
-            node, several = select_node(field, int(query)), True
+        is_node = several = field.tree is not None and field.regions.count <= query < len(field.tree)
     else:
         match = match_regions(field, query, rules, excluded=excluded)
         several = rules.all_of_class or len(query) > 1 or (excluded is not None and len(excluded) > 0)
-    selection = select_gaussians(field, match, rules) if node is None else node
-    kept = trim(field, selection, ("all" if several else "supported") if outliers else None)
+    if is_node:
+        members = node_members(np.asarray(field.tree), np.asarray(field.leaf), int(query))
+        score = np.asarray(1.0, np.float32)
+        selection = Selection(members, members.astype(np.float32), np.asarray(query, np.int32), score)
+    else:
+        selection = select_gaussians(field, match, rules)
+    mask, clusters = trim(field, selection, ("all" if several else "supported") if outliers else None)
     count, overlap = 1, field.votes.overlap
-    if overlap is not None and node is None and rules.code_threshold is None:
+    if overlap is not None and not is_node and rules.code_threshold is None:
         chosen = np.flatnonzero(match.chosen)
         linked = np.asarray(overlap)[np.ix_(chosen, chosen)] >= MIN_FRAGMENT_OVERLAP
-        count = max(1, min(sparse.csgraph.connected_components(linked, directed=False)[0], kept.clusters))
-    return _Answered(selection, kept, count)
+        count = max(1, min(sparse.csgraph.connected_components(linked, directed=False)[0], clusters))
+    return selection, mask, count
 
 
 def match_regions(
@@ -121,7 +110,7 @@ def match_regions(
     if field.regions.count == 0:
         return NO_REGIONS
     regions = field.regions.embeddings, field.regions.pixel_counts, field.votes.overlap
-    return _match((*regions, queries, excluded, unrelated_words(field)), rules)
+    return _match((*regions, queries, excluded, field.unrelated_words), rules)
 
 
 def _numpy_outside_traces(function: Callable) -> Callable:
@@ -223,10 +212,10 @@ def _select_from_votes(votes: Votes, match: RegionMatch, min_share: Number) -> S
     return Selection(mask, share, *match[1:])
 
 
-def trim(field: LanguageField, selection: Selection, keep: str | None = "supported") -> OutlierResult:
-    """Drops the selected Gaussians that lie apart (`remove_outliers`); None in `keep` drops none. Host code."""
+def trim(field: LanguageField, selection: Selection, keep: str | None) -> tuple[Bool[np.ndarray, " n"], int]:
+    """Drops the selected Gaussians that lie apart, as `split_outliers` does; None in `keep` drops none. Host code."""
     if keep is None:
-        return OutlierResult(np.asarray(selection.mask), 0)
+        return np.asarray(selection.mask), 0
     weight = np.clip(np.asarray(selection.similarity), 0.0, 1.0) * np.asarray(field.votes.total)
     return split_outliers(field.gaussians.means, selection.mask, keep=keep, weight=weight)
 

@@ -12,12 +12,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
-from jsecon.query.match import (
-    compare_words,
-    region_similarities,
-    unrelated_words,
-    view_count_weight,
-)
+from jsecon.query.match import compare_words, region_similarities, view_count_weight
 from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.types import Array, LanguageField
 
@@ -73,7 +68,7 @@ def query_classes(
         count, dtype = field.gaussians.count, jnp.asarray(field.regions.embeddings).dtype
         return _Classes(jnp.full(count, -1, jnp.int32), jnp.zeros((count, texts.shape[0]), dtype))
     arrays = field.regions.embeddings, texts, field.regions.pixel_counts, field.votes
-    return _classes(*jax.tree.map(jnp.asarray, arrays), unrelated_words(field), rules, standardise, every)
+    return _classes(*jax.tree.map(jnp.asarray, arrays), field.unrelated_words, rules, standardise, every)
 
 
 @functools.partial(jax.jit, static_argnames=("standardise", "every"))

@@ -24,10 +24,9 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jsecon.field.regions import mean_residuals
 from jsecon.field.similarity import Number, similarities
-from jsecon.field.tree import node_members
 from jsecon.numerics import array_module, cosine_matrix, inline_jit, normalize
 from jsecon.query.rules import ABSENT, FOUND, QueryRules
-from jsecon.types import Array, LanguageField, Selection
+from jsecon.types import Array
 
 HEIGHT_WEIGHT = 0.5
 """Weight of the heights in the margin of a text among unrelated words: so many deviations of heights as of similarities
@@ -35,12 +34,6 @@ are reached by absent colours in ray-traced rooms, and more by what is present w
 MIN_FRAGMENT_OVERLAP = 0.1
 """Smallest soft IoU of the Gaussians of two fragments. In twins of two scenes 106 of 115 pieces reach it, and 4 of 58
 other regions."""
-
-
-def unrelated_words(field: LanguageField) -> Array | None:
-    """Returns the unrelated words of a field (W, E), or None if it has none."""
-    words = field.unrelated_words
-    return words if words is not None and len(words) else None
 
 
 class RegionMatch(NamedTuple):
@@ -95,7 +88,7 @@ def compare_words(
     embeddings: Float[Array, "r e"], words: Float[Array, "w e"] | None, retrieval: str
 ) -> _WordScores | None:
     """Compares regions with unrelated words, as `region_similarities` does with a text; None without words."""
-    if words is None:
+    if words is None or not len(words):
         return None
     units = normalize(words.astype(embeddings.dtype))
     mean = _mean(units)
@@ -140,7 +133,7 @@ def region_similarities(
 
     "contrast" subtracts the mean of the unrelated words from the text; "cosine" does not.
     """
-    mean = None if words is None else _mean(normalize(words.astype(text.dtype)))
+    mean = None if words is None or not len(words) else _mean(normalize(words.astype(text.dtype)))
     return similarities(embeddings, _text_direction(text, mean, retrieval))
 
 
@@ -258,9 +251,3 @@ def _reaches(similarity: Float[Array, " r"], known: Bool[Array, " r"], relative_
     largest = xp.where(known, similarity, -xp.inf).max()
     reach = xp.where(largest > median, largest - median, 0.0)
     return known & (similarity >= median + relative_score * reach) & (largest > median)
-
-
-def select_node(field: LanguageField, node: int) -> Selection:
-    """Selects the Gaussians under a node of `LanguageField.tree`, with score 1."""
-    members = node_members(np.asarray(field.tree), np.asarray(field.leaf), node)
-    return Selection(members, members.astype(np.float32), np.asarray(node, np.int32), np.asarray(1.0, np.float32))

@@ -5,8 +5,6 @@ lists are quadratic in time and memory. A large selection is therefore clustered
 number of its splats as sample weight.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse  # loads csgraph on its first use
@@ -20,15 +18,6 @@ EPS_SPACINGS = 6.0
 weakly textured parts leave between splats, and is far below the distance between objects."""
 MIN_SAMPLES = 10
 """Neighbours within eps, itself included, that make a core point; a surface has about 100 within 6 spacings."""
-
-
-class OutlierResult(NamedTuple):
-    """A selection without its outliers."""
-
-    mask: Bool[np.ndarray, " n"]
-    """The Gaussians that stay."""
-    clusters: int
-    """Clusters that stay; 0 if there is none."""
 
 
 def remove_outliers(
@@ -59,7 +48,7 @@ def remove_outliers(
     Raises:
       ValueError: An option is out of range, or `weight` has another length.
     """
-    return split_outliers(means, mask, weight=weight, keep=keep).mask
+    return split_outliers(means, mask, weight=weight, keep=keep)[0]
 
 
 def split_outliers(
@@ -68,8 +57,8 @@ def split_outliers(
     *,
     weight: Float[Array, " n"] | None = None,
     keep: str = "supported",
-) -> OutlierResult:
-    """Removes outliers as `remove_outliers` does, and counts the clusters that stay."""
+) -> tuple[Bool[np.ndarray, " n"], int]:
+    """Removes outliers as `remove_outliers` does: (N,) the mask that stays, and the number of clusters in it."""
     require_one_of("remove_outliers", keep, ("largest", "supported", "all"), "Use 'all' to keep several objects.")
     if weight is not None:
         require_shape("weight", weight, (len(means),), "Give one weight per Gaussian.")
@@ -80,13 +69,13 @@ def split_outliers(
     mask[chosen[~finite]] = False
     chosen, points = chosen[finite], points[finite]
     if len(chosen) < MIN_SAMPLES:
-        return OutlierResult(mask, 0)
+        return mask, 0
     eps = _default_eps(points)
     if _one_component(points, eps):  # then nothing lies apart, and DBSCAN is not needed
-        return OutlierResult(mask, 1)
+        return mask, 1
     labels = _dbscan(points, eps)
     if labels.max() < 0:
-        return OutlierResult(mask, 0)
+        return mask, 0
     clustered = labels >= 0
     sizes = np.bincount(labels[clustered])
     stays = np.ones(len(sizes), bool)
@@ -97,7 +86,7 @@ def split_outliers(
         support = np.bincount(labels[clustered], np.nan_to_num(support[clustered], posinf=0.0))
         stays = support >= 0.1 * support.max()
     mask[chosen[~(clustered & stays[labels])]] = False
-    return OutlierResult(mask, int(stays.sum()))
+    return mask, int(stays.sum())
 
 
 def _default_eps(points: Float[Array, "m 3"]) -> float:

@@ -13,13 +13,27 @@ from jsecon.types import Array, LanguageField, Regions
 
 
 def match_parts(
-    field: LanguageField, texts: Float[Array, "q e"], wholes: Collection[int], rules: QueryRules
+    field: LanguageField,
+    texts: Float[Array, "q e"],
+    rules: QueryRules,
+    wholes: Collection[int] | None = None,
+    *,
+    unless: int = -1,
 ) -> tuple[Int[np.ndarray, " m"], int]:
     """Finds the parts of regions that a text names for certain, unless it names the regions better.
+
+    Args:
+      field: The field.
+      texts: Embeddings of the text.
+      rules: How texts match.
+      wholes: The regions; None takes all.
+      unless: A region that may be what the text names, or -1. Where one of the parts is most of it, there are none: the
+        larger is meant.
 
     Returns:
       Nodes of the tree, and an index of `rules.STATES`: ABSENT if there are none.
     """
+    wholes = range(field.regions.count) if wholes is None else wholes
     own = np.flatnonzero(np.isin(part_objects(field), list(wholes)))
     if field.part_regions is None or not len(own):
         return np.zeros(0, int), ABSENT
@@ -30,19 +44,10 @@ def match_parts(
     match = match_regions(dataclasses.replace(field, regions=regions, votes=votes), texts, rules)
     if not 0 <= int(match.region) < len(own) or int(match.state) < FOUND:
         return np.zeros(0, int), ABSENT
-    return np.asarray(field.part_nodes)[own[np.asarray(match.chosen)[: len(own)]]], int(match.state)
-
-
-def match_lone_parts(
-    field: LanguageField, texts: Float[Array, "q e"], region: int, rules: QueryRules
-) -> tuple[Int[np.ndarray, " m"], int]:
-    """Finds the parts of any region that a text names, as `match_parts` does, if no region has that name for certain.
-
-    There are none where one of them is most of `region`, which may be what the text names, or -1: the larger is meant.
-    """
-    nodes, state = match_parts(field, texts, range(field.regions.count), rules)
-    if len(nodes) and region >= 0:
-        inside = np.asarray(field.leaf)[node_members(np.asarray(field.tree), np.asarray(field.leaf), region)]
-        if any(node_members(np.asarray(field.tree), inside, int(node)).mean() > 0.5 for node in nodes):
+    nodes = np.asarray(field.part_nodes)[own[np.asarray(match.chosen)[: len(own)]]]
+    if unless >= 0:
+        tree, leaf = np.asarray(field.tree), np.asarray(field.leaf)
+        inside = leaf[node_members(tree, leaf, unless)]
+        if any(node_members(tree, inside, int(node)).mean() > 0.5 for node in nodes):
             return np.zeros(0, int), ABSENT
-    return nodes, state
+    return nodes, int(match.state)

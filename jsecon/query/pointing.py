@@ -64,24 +64,10 @@ def _alphas(gaussians: Gaussians, camera: Camera, x: Array | float, y: Array | f
     return jnp.where(counts, jnp.minimum(alpha, MAX_ALPHA), 0.0), splats.depths
 
 
-def region_shares_seen(field: LanguageField, camera: Camera, x: int, y: int) -> Float[np.ndarray, " r"]:
-    """Computes how much of a pixel each region makes up: sum_n w_n p_nr, w the weights alpha T and p the vote shares.
-
-    Each is at most the pixel's alpha.
-    """
-    ids, weights = _pixel_weights(field.gaussians, camera, x, y)
-    shares = np.zeros(field.regions.count)
-    if not len(ids):
-        return shares
-    votes = votes_of_rows(field.votes, np.resize(ids, 1 << (len(ids) - 1).bit_length()))  # few sizes to compile for
-    regions = votes.regions[: len(ids)]
-    share = np.nan_to_num(np.asarray(vote_shares(votes))[: len(ids)].astype(np.float64))
-    np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
-    return shares
-
-
 def region_at(field: LanguageField, frame: int | str, x: int, y: int) -> int:
-    """Finds the region that makes up most of a pixel.
+    """Finds the region that makes up most of a pixel: the largest sum_n w_n p_nr.
+
+    The weights w of the Gaussians there are alpha T, and p are their vote shares. The sum is at most the pixel's alpha.
 
     Args:
       field: The field.
@@ -100,8 +86,15 @@ def region_at(field: LanguageField, frame: int | str, x: int, y: int) -> int:
         remedy = f"Give x and y in the frames as the run used them, {width}x{height}."
         known = f"column 0 to {width - 1}, row 0 to {height - 1}"
         raise InputError("pixel", f"column {x}, row {y} is outside the frame", known, remedy)
-    shares = region_shares_seen(field, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
-    return int(shares.argmax()) if shares.size and shares.max() >= MIN_SHARE else -1
+    ids, weights = _pixel_weights(field.gaussians, jax.tree.map(jnp.asarray, field.cameras)[frame], x, y)
+    if not len(ids) or not field.regions.count:
+        return -1
+    votes = votes_of_rows(field.votes, np.resize(ids, 1 << (len(ids) - 1).bit_length()))  # few sizes to compile for
+    regions = votes.regions[: len(ids)]
+    share = np.nan_to_num(np.asarray(vote_shares(votes))[: len(ids)].astype(np.float64))
+    shares = np.zeros(field.regions.count)
+    np.add.at(shares, np.where(regions >= 0, regions, 0), share * weights[:, None])
+    return int(shares.argmax()) if shares.max() >= MIN_SHARE else -1
 
 
 def lift(
@@ -158,20 +151,6 @@ def lift(
     mask = finite & (share >= threshold)
     similarity = np.where(finite, share, 0.0).astype(np.float32)
     return Selection(*map(jnp.asarray, (mask, similarity, np.int32(region), np.float32(score))))
-
-
-def box_mask(field: LanguageField, x0: int, y0: int, x1: int, y1: int) -> Int[np.ndarray, "h w"]:
-    """Makes the mask of a box for `lift`: OUTSIDE, and UNKNOWN from column x0 and row y0 to x1 and y1.
-
-    Raises InputError if the box has no pixel of the field's frames.
-    """
-    mask = np.full((field.cameras.height, field.cameras.width), OUTSIDE, np.int32)
-    mask[max(y0, 0) : max(y1 + 1, 0), max(x0, 0) : max(x1 + 1, 0)] = UNKNOWN
-    if not mask.any():
-        size = f"{field.cameras.width}x{field.cameras.height}"
-        remedy = "Give its left, upper, right and lower end, in the frames as the run used them."
-        raise InputError("box", f"{x0} {y0} {x1} {y1} has no pixels of a frame of {size}", remedy=remedy)
-    return mask
 
 
 def _regions_within(field: LanguageField, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
     if up is None:
         up, sure, evidence = find_up(points)
     else:
-        up, sure, evidence = _direction(up), True, "given"
+        up, sure, evidence = np.asarray(up, np.float64), True, "given"
     up = up / np.linalg.norm(up)
     first, second = axes_across(up)
     flat = np.stack([points @ first, points @ second], axis=1)
@@ -149,14 +149,6 @@ def scene_frame(points: Float[np.ndarray, "p 3"], up: np.ndarray | None = None) 
     low, high = np.quantile(local, [TRIM, 1 - TRIM], axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * np.linalg.norm(high - low))
     return SceneFrame(axes, ((low + high) / 2) @ axes, half, sure, evidence)
-
-
-def _direction(up: Any) -> np.ndarray:
-    """Returns a given up axis as a vector (3,) of any length."""
-    up = np.asarray(up, np.float64)
-    if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
-        raise InputError("--up", f"{up.tolist()} is no direction", "", "Give three numbers, for example 0 0 1.")
-    return up
 
 
 def _up_of_cameras(cameras: Camera) -> UpAxis:
@@ -273,5 +265,5 @@ def field_up(field: LanguageField, up: Sequence[Any] | np.ndarray | None = None)
     """
     if up is None:
         return field.up or find_up_axis(field.gaussians, field.cameras)
-    turned = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ _direction(up)
+    turned = np.asarray(field.source_from_scene, np.float64)[:3, :3].T @ np.asarray(up, np.float64)
     return UpAxis(tuple((turned / np.linalg.norm(turned)).tolist()), "what was given")

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 from scipy.spatial import KDTree
 
-from jsecon.errors import InputError, require
+from jsecon.errors import InputError
 from jsecon.field.evidence import MAX_WHOLE, each_view, plan_evidence
 from jsecon.fit.resize import scale_cameras
 from jsecon.parallel import map_over_processes, map_views
@@ -94,7 +94,6 @@ def place_cameras(
       up: (3,) up axis of the world; None finds it (`scene_frame`).
       progress: Called as progress(done, total) while candidates are rendered.
     """
-    require(views >= 1, "views", views, ">= 1", "Ask for at least one view.")
     points = surface_points(gaussians)
     frame = scene_frame(points, up)
     places = _free_places(points, frame)

@@ -4,8 +4,8 @@ Host code: NumPy in, NumPy out. Frames are uint8 RGB.
 """
 
 import dataclasses
-from collections.abc import Collection
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Collection
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -13,25 +13,11 @@ CANONICAL = ("object", "things", "stuff", "texture")
 """LERF's canonical phrases, which a query must exceed."""
 
 
-@runtime_checkable
-class Segmenter(Protocol):
-    """Proposes regions of one frame."""
-
-    def __call__(self, frame: np.ndarray, index: int) -> np.ndarray:
-        """Proposes masks (M, H, W) bool of a frame (H, W, 3) of the capture, best first; they may overlap."""
-        ...
-
-
-@runtime_checkable
-class Tracker(Protocol):
-    """Follows regions of one frame through all frames."""
-
-    def __call__(self, frames: np.ndarray, index: int, prompts: np.ndarray) -> np.ndarray:
-        """Follows the masks (B, H, W) bool of the frame at an index through frames (T, H, W, 3).
-
-        Returns (T, H, W) int16: the index of a mask, or -1. The tracker resolves overlaps.
-        """
-        ...
+Segmenter: TypeAlias = Callable[[np.ndarray, int], np.ndarray]
+"""Proposes masks (M, H, W) bool, best first, which may overlap, of a frame (H, W, 3) and its index in the capture."""
+Tracker: TypeAlias = Callable[[np.ndarray, int, np.ndarray], np.ndarray]
+"""Follows masks through frames, from frames (T, H, W, 3), the index of one, and masks (B, H, W) bool there: returns
+(T, H, W) int16, the index of a mask, or -1. The tracker resolves overlaps."""
 
 
 @runtime_checkable
