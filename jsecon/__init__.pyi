@@ -46,7 +46,8 @@ from .query.pointing import lift as lift, region_at as region_at
 from .query.render import selection_mask as selection_mask
 from .query.rules import QueryRules as QueryRules
 from .read.captures.capture import load_capture as load_capture
-from .read.splats.files import load_gaussians as load_gaussians, save_gaussians as save_gaussians
+from .read.splats.files import load_gaussians as load_gaussians
+from .read.splats.writing import save_gaussians as save_gaussians
 from .splat.capacity import plan_capacity as plan_capacity
 from .splat.plan import plan_view as plan_view, render_plan as render_plan
 from .splat.project import project as project

@@ -14,7 +14,7 @@ from capture_files import png, png_chunk, refused
 
 from jsecon import load_capture
 from jsecon.errors import InputError
-from jsecon.read.captures.images import image_header, read_depth, read_image, read_label_image, write_image
+from jsecon.read.captures.images import MAX_PIXELS, image_header, read_depth, read_image, read_label_image, write_image
 from jsecon.read.captures.lens import Lens, undistorted_pinhole, undistortion_maps
 
 RNG = np.random.default_rng(3)
@@ -99,7 +99,9 @@ def test_too_large_images_are_shrunk_or_say_the_limit(tmp_path, monkeypatch):
         read_image(tmp_path / "big.png")
     monkeypatch.setattr("jsecon.read.captures.images.MAX_PIXELS", 101 * 61)
     PIL.Image.fromarray(corners(201, 121)).save(tmp_path / "big.jpg", quality=95)
+    limit = PIL.Image.MAX_IMAGE_PIXELS
     assert image_header(tmp_path / "big.jpg").upright == (101, 61)
+    assert limit == PIL.Image.MAX_IMAGE_PIXELS < MAX_PIXELS
     image = read_image(tmp_path / "big.jpg")
     assert image.shape == (61, 101, 3)
     assert np.abs(image[:60, :100].astype(int) - corners(100, 60)).mean() < 6

@@ -119,7 +119,7 @@ def test_a_segmenter_takes_the_frames_that_number_and_time_allow(seen, tmp_path)
     run, _, _ = seen
     for limit, count in (({"vision_frames": 3}, 3), ({"vision_minutes": 1e-6}, 2)):
         options = dataclasses.replace(run.options, **limit)
-        context = RunContext(options, model_loading.open_models(options, tmp_path), tmp_path)
+        context = RunContext(*model_loading.open_models(options, tmp_path), tmp_path)
         found, _ = compute_stage(context, "objects", load=run.capture, gaussians=run.field.gaussians)
         assert len(found.value.labels) == len(found.value.frames) == count
         assert not run.capture.held_out[found.value.frames].any()

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from jsecon import load_capture
 from jsecon.pipeline.scene import plan_capture
 from jsecon.read.captures.images import write_image
-from jsecon.read.captures.lens import Lens, resample_depth
 
 _RANDOM = small_capture(count=12)
 _ONE = {name: np.full(12, getattr(_RANDOM.cameras, name)[0]) for name in ("fx", "fy", "cx", "cy")}
@@ -158,8 +157,6 @@ def test_a_depth_camera_of_its_own_is_seen_through_the_colour_camera(tmp_path):
     columns = rays * 30 + 20
     seen = np.where((columns >= 0) & (columns < 40), np.floor(columns) / 10 + 1, 0)
     np.testing.assert_allclose(found.depths[0, 8], seen, atol=1e-5)
-    same = Lens(24, 16, *K)
-    np.testing.assert_array_equal(resample_depth(CAPTURE.depths[0], same, same), CAPTURE.depths[0])
 
 
 @pytest.mark.parametrize(("camera", "fx", "bent"), [("freiburg1", 517.3, True), ("fr3", 535.4, False)])

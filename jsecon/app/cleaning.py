@@ -17,7 +17,7 @@ from jsecon.pipeline.scene import open_bare_scene
 from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_scene
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.read.splats.files import require_writable_format, save_gaussians
+from jsecon.read.splats.writing import require_writable_format, save_gaussians
 from jsecon.splat.visible import hide
 from jsecon.types import Camera, Capture, Gaussians, Progress
 from jsecon.views.clean import KINDS, find_litter

@@ -23,7 +23,7 @@ from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
 from jsecon.query.solids import object_solid, surface_points
-from jsecon.read.splats.files import require_writable_format
+from jsecon.read.splats.writing import require_writable_format
 
 _Item: TypeAlias = dict[str, Any]
 """an object with its box, hull and primitive, as the JSON of solids has it with lists in place of arrays"""

@@ -29,7 +29,7 @@ from jsecon.process import peak_memory_mib
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.captures.images import write_image
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
-from jsecon.read.splats.files import require_writable_format, save_gaussians
+from jsecon.read.splats.writing import require_writable_format, save_gaussians
 from jsecon.types import Capture, Gaussians, Quality
 
 FILES = ("field.safetensors", "report.html", "metrics.json")

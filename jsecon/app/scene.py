@@ -8,6 +8,7 @@ frames and units.
 import contextlib
 import dataclasses
 import functools
+import re
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -39,7 +40,7 @@ from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, read_date
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints, run_warnings
+from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query, split_part
@@ -49,8 +50,8 @@ from jsecon.query.pointing import OUTSIDE, UNKNOWN, frame_index, lift, region_at
 from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
 from jsecon.read.captures.frames import move_capture, take_frames
-from jsecon.read.splats.files import save_gaussians
 from jsecon.read.splats.points import load_point_cloud, save_point_cloud
+from jsecon.read.splats.writing import save_gaussians
 from jsecon.splat.points import nearest_gaussians
 from jsecon.splat.transform import transform_gaussians
 from jsecon.splat.visible import points_in_view
@@ -423,7 +424,7 @@ class Scene:
         embedded = embedder.embed_text(included + excluded)
         texts, without = embedded[: len(included)], embedded[len(included) :]
         found = answer_question(field, texts, rules, excluded=without, outliers=query.outliers)
-        warnings = [] if found[1].any() else run_warnings(field)
+        warnings = [] if found[1].any() else _run_warnings(field)
         reason = " ".join(["no region matches it; the run warned:", *warnings]).rstrip(".") if warnings else ""
         return self._finish(query, found, reason)
 
@@ -816,6 +817,15 @@ def locate(
       InputError: As for `Scene.locate`.
     """
     return Scene(field, embedder).locate(text, frame=frame).place
+
+
+def _run_warnings(field: LanguageField) -> list[str]:
+    """What the run that made a field warned of: the first sentence of each warning."""
+    try:
+        warnings = parse_json(field.provenance or "{}").get("warnings", [])
+        return [re.split(r"(?<=\.) ", warning)[0] for warning in warnings]
+    except (ValueError, TypeError, AttributeError):  # not written by jsecon
+        return []
 
 
 def _pixel_of(point: At, width: int, height: int) -> tuple[int, int]:

@@ -147,14 +147,6 @@ def models_of_name(name: str, role: Role | None) -> list[HubModel]:
     raise InputError(repr(name), f"no folder and no known {role or 'model'}", "", remedy)
 
 
-def model_name(folder: str | Path, role: Role) -> str:
-    """Returns the name of the model of a folder: that of the catalogue, or that of the folder."""
-    folder = Path(folder)
-    repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
-    names = (row.name for row in catalogue() if (row.role, row.repository) == (role, repository))
-    return next(names, folder.name)
-
-
 def cached_address(folder: Path) -> str | None:
     """Returns the address "hub:owner/name@commit" of a folder of the hub's cache; None for every other folder."""
     parts = folder.absolute().parts

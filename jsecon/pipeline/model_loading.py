@@ -31,8 +31,11 @@ def _local_folders(models: Mapping[Role, HubModel | Path]) -> dict[Role, Path]:
     return {role: folder for role, folder in folders.items() if folder is not None}
 
 
-def with_folders(options: Options) -> Options:
-    """Replaces the models in options by their folders on this machine, or raises InputError."""
+def open_models(options: Options, store: Path) -> tuple[Options, Models]:
+    """Opens the models of a run, and replaces them in its options by their folders on this machine.
+
+    `store` is the folder that caches proposals.
+    """
     recommended = RECOMMENDED if options.models == "auto" else {}
     models = {}
     for role in get_args(Role):
@@ -40,11 +43,7 @@ def with_folders(options: Options) -> Options:
         choice = recommended.get(role) if choice is None else choice
         if choice not in (None, GEOMETRIC):
             models[role] = parse_model(choice, role)
-    return dataclasses.replace(options, **_local_folders(models))
-
-
-def open_models(options: Options, store: Path) -> Models:
-    """Opens the models of a run by their folders; `store` is the folder that caches proposals."""
+    options = dataclasses.replace(options, **_local_folders(models))
     segmenter = tracker = None
     if options.segmenter is not None:
         from jsecon.networks.sam import SamSegmenter
@@ -54,7 +53,7 @@ def open_models(options: Options, store: Path) -> Models:
         from jsecon.networks.sam2 import Sam2Tracker
 
         tracker = Sam2Tracker(Path(options.tracker))
-    return Models(_open_embedder(options.embedder), segmenter, tracker)
+    return options, Models(_open_embedder(options.embedder), segmenter, tracker)
 
 
 def _open_embedder(folder: str | Path | None) -> Embedder:

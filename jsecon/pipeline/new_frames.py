@@ -23,7 +23,7 @@ from jsecon.poses.resection import MIN_INLIERS, pose_finder
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.capture import lone_photographs, read_posed_images
 from jsecon.read.captures.frames import FrameOptions, frame_names, move_capture, take_frames
-from jsecon.read.captures.images import decode_jpeg, encode_jpeg, read_image
+from jsecon.read.captures.images import encode_jpeg, read_image
 from jsecon.read.masks.masks import load_proposals
 from jsecon.splat.sh import C0
 from jsecon.types import Capture, LanguageField, Progress, Votes
@@ -94,7 +94,7 @@ def _place(
     """Finds the poses of photographs by the pictures of the ledger."""
     rows = [t for t, name in enumerate(field.names) if name in ledger.views]
     views = jax.tree.map(lambda a: np.asarray(a)[rows], field.cameras)
-    find_pose = pose_finder(field.gaussians, views, [decode_jpeg(ledger.views[field.names[t]].picture) for t in rows])
+    find_pose = pose_finder(field.gaussians, views, [_decode_jpeg(ledger.views[field.names[t]].picture) for t in rows])
     names, cameras, frames = [], [], []
     for done, (name, file) in enumerate(files.items()):
         try:
@@ -118,6 +118,14 @@ def _place(
     placed = jax.tree.map(lambda *columns: np.stack(columns), *cameras) if cameras else views[:0]
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(len(names), bool), None
     return Capture(pixels, placed, *nothing, np.asarray(field.source_from_scene), tuple(names))
+
+
+def _decode_jpeg(data: UInt8[np.ndarray, " b"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Decodes what `encode_jpeg` encoded; ValueError if it is damaged."""
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if image is None:
+        raise ValueError("a picture is no JPEG")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def make_views(

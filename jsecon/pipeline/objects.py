@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence
 from jsecon.field.regions import choose_crops, crop_geometry, join_views, region_embeddings, views_needed
 from jsecon.fit.start import points_from_depth
-from jsecon.networks.hub import model_name
+from jsecon.networks.hub import PREFIX, Role, cached_address, catalogue
 from jsecon.paper.algorithm1 import masklets
 from jsecon.paper.autoencoder import encode, train_autoencoder
 from jsecon.paper.distill import distill_votes
@@ -27,7 +28,6 @@ from jsecon.paper.tracker import GeometricTracker
 from jsecon.parallel import map_views
 from jsecon.pipeline.options import GEOMETRIC, Options
 from jsecon.pipeline.stages import (
-    CastVotes,
     ObjectLabels,
     RunContext,
     Stage,
@@ -72,7 +72,7 @@ def _plan_labels(context: RunContext) -> Stage:
         how = f"proposals read from {options.proposals.name}"
         key_options |= context.key_options("level")
     elif models.segmenter is not None:
-        how = f"proposals of level {options.level} by {model_name(options.segmenter or '', 'segmenter')}"
+        how = f"proposals of level {options.level} by {_model_name(options.segmenter or '', 'segmenter')}"
         key_options["model"] = models.segmenter.name
     else:
         how = "proposals by colour and texture"
@@ -82,10 +82,18 @@ def _plan_labels(context: RunContext) -> Stage:
     elif options.tracker == GEOMETRIC:
         how += ", followed through the Gaussians"
     else:
-        how += f", followed by {model_name(options.tracker, 'tracker')}"
+        how += f", followed by {_model_name(options.tracker, 'tracker')}"
     key_options["tracker"] = options.tracker if models.tracker is None else models.tracker.name
     after, files = ("load", "gaussians"), (options.proposals,)
     return Stage("objects", how, _find_objects, after, key_options, files, distributed=options.tracker is None)
+
+
+def _model_name(folder: str | Path, role: Role) -> str:
+    """The name of the model of a folder: that of the catalogue, or that of the folder."""
+    folder = Path(folder)
+    repository = (cached_address(folder) or "").removeprefix(PREFIX).partition("@")[0]
+    names = (row.name for row in catalogue() if (row.role, row.repository) == (role, repository))
+    return next(names, folder.name)
 
 
 def _plan_regions(context: RunContext) -> list[Stage]:
@@ -318,12 +326,12 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
     unseen = int((np.asarray(accumulated.views) == 0).sum())
     if unseen:
         notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians")
-    return StageResult(CastVotes(accumulated, packed), notes)
+    return StageResult((accumulated, packed), notes)
 
 
 def _compute_codes(stage: StageInput) -> StageResult:
     """Trains the paper's autoencoder, and distils the codes of the regions into the Gaussians by their votes."""
-    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes.sum
+    options, embeddings, cast = stage.context.options, stage.results.regions.embeddings, stage.results.votes[0]
     if not np.any(np.asarray(embeddings)):
         raise InputError("--paper", "no region has an embedding to train the autoencoder on", remedy="Leave it out.")
     key = jax.random.key(options.seed)

@@ -40,10 +40,6 @@ class Console:
                 self._erase()
                 print(text, file=self._out, flush=True)
 
-    def step(self, step: Step) -> None:
-        """Prints a step that is planned."""
-        self.print_line(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
-
     def done(self, name: str, seconds: float, fresh: bool) -> None:
         """Prints the end of a stage."""
         if fresh:

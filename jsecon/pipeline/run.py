@@ -23,7 +23,8 @@ from jsecon.field.ledger_file import save_with_ledger
 from jsecon.field.membership import normalise_votes
 from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
-from jsecon.pipeline import cache, model_loading
+from jsecon.pipeline import cache
+from jsecon.pipeline.model_loading import open_models
 from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console, Step
@@ -175,9 +176,7 @@ def _compute_stages(
         require_writable(context.out)
     with exclusive_lock(context.out):
         cache.prepare(context.out / "cache")
-        console.print_line(f"{context.options.capture} -> {context.out}")
-        for step in state.steps:
-            console.step(step)
+        _print_plan(console, f"{context.options.capture} -> {context.out}", state.steps)
         context.models.require_ready(state.running)
         for stage in stage_list:
             _compute_stage(context, stage, state, console)
@@ -185,6 +184,13 @@ def _compute_stages(
                 on_scene(state.results.load, state.results.gaussians)
         _broadcast(None, state)
     return state
+
+
+def _print_plan(console: Console, title: str, steps: list[Step]) -> None:
+    """Prints the steps that are planned."""
+    console.print_line(title)
+    for step in steps:
+        console.print_line(f"  {step.name:<16} {step.status:<9} {step.why}".rstrip())
 
 
 def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console: Console) -> None:
@@ -279,7 +285,7 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
     scale = capture.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
     field = LanguageField(
         gaussians=results.gaussians,
-        votes=normalise_votes(results.votes.sum, embedded),
+        votes=normalise_votes(results.votes[0], embedded),
         regions=of_capture(embedded),
         cameras=capture.cameras,
         canonical_phrases=np.asarray(embedder.canonical_phrases, np.float32),
@@ -304,7 +310,7 @@ def _make_ledger(results: Results) -> Ledger:
     capture, regions, views = results.load, results.regions, {}
     assert regions.embedded is not None
     assert regions.view_embeddings is not None
-    for t, (frame, evidence) in enumerate(zip(results.objects.frames, results.votes.evidence)):
+    for t, (frame, evidence) in enumerate(zip(results.objects.frames, results.votes[1])):
         shown, rows = np.flatnonzero(regions.pixel_counts[:, t]), regions.embedded[:, 1] == t
         pixels = np.stack([shown, regions.pixel_counts[shown, t]]).astype(np.int32)
         embedded = np.asarray(regions.embedded[rows, 0]), np.asarray(regions.view_embeddings[rows])
@@ -316,8 +322,7 @@ def _make_ledger(results: Results) -> Ledger:
 def _open_context(options: Options, out: Path) -> RunContext:
     """Starts jax's devices, and opens the models of a run."""
     start_backend()
-    options = model_loading.with_folders(options)
-    return RunContext(options, model_loading.open_models(options, out / "cache"), out)
+    return RunContext(*open_models(options, out / "cache"), out)
 
 
 def current_field(options: Options, out: Path) -> Path | None:
@@ -341,9 +346,7 @@ def dry_run(options: Options, out: Path, *, scene_only: bool = False, console: C
         plan = _plan(context, plan_scene(context) if scene_only else _run_stages(context))
         context.models.require_ready(plan.running)
         _check_inputs(context, plan)
-    console.print_line(f"{options.capture} -> {out}, a dry run")
-    for step in plan.steps:
-        console.step(step)
+    _print_plan(console, f"{options.capture} -> {out}, a dry run", plan.steps)
     console.print_line("Nothing was written.")
     return {"stages": plan.steps}
 

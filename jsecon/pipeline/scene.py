@@ -13,15 +13,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError, join_first
 from jsecon.fit.quality import QUICK_LONG_SIDE, measure_quality
 from jsecon.fit.start import starting_gaussians
+from jsecon.numerics import FRUSTUM_MARGIN, NEAR
 from jsecon.pipeline.ignoring import ignore_named
 from jsecon.pipeline.options import Options, is_bare_scene
-from jsecon.pipeline.scene_files import check_overlap, fit_background, place_in_capture, read_scene, with_points
+from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_scene
 from jsecon.pipeline.stages import WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
@@ -37,6 +39,9 @@ from jsecon.read.captures.lens import undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.panoramas import find_panoramas, has_mark
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, read_header, write_frames
+from jsecon.read.splats.points import gaussians_of_cloud
+from jsecon.splat.render import render_depth
+from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress, UpAxis
 from jsecon.views.capture import render_capture
@@ -202,7 +207,7 @@ def _load_frames(stage: StageInput) -> StageResult:
     folder = options.capture if poses is None else stage.context.out / "cache" / poses
     capture = load_capture(folder, **sizes, progress=stage.progress)
     if options.points is not None:
-        capture = with_points(capture, options.points, stage.progress)
+        capture = _with_points(capture, options.points, stage.progress)
     if options.ignore is not None:
         texts = [text.strip() for text in options.ignore.split(",")]
         capture = ignore_named(capture, texts, stage.context.models, stage.context.out / "masks", stage.progress)
@@ -222,6 +227,41 @@ def _load_frames(stage: StageInput) -> StageResult:
     return StageResult(better, notes=(*notes, *better.notes[len(capture.notes) :]))
 
 
+def _with_points(capture: Capture, path: Path, progress: Progress) -> Capture:
+    """Gives a capture the points of a cloud in the world of its files, and their depth if it has none of its own."""
+    cloud, notes = gaussians_of_cloud(path, 100_000)  # as many as a fit starts from with depth frames
+    scene = jax.tree.map(jnp.asarray, transform_gaussians(cloud, np.linalg.inv(capture.source_from_scene)))
+    train = np.flatnonzero(~np.asarray(capture.held_out))
+    _check_overlap(scene, capture.cameras[train], str(path))
+    depths = capture.depths
+    if depths is None:
+        depths = np.zeros(capture.frames.shape[:3], np.float32)
+        for n, t in enumerate(train):
+            depth, alpha = map(np.asarray, render_depth(scene, capture.cameras[int(t)]))
+            depths[t] = np.where(alpha > 0.5, depth, 0)
+            progress(n + 1, len(train))
+    colours = np.rint(255 * np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)).astype(np.uint8)
+    given = {"points": np.asarray(scene.means), "point_colors": colours, "depths": depths}
+    return dataclasses.replace(capture, **given, notes=(*capture.notes, *notes))
+
+
+def _check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
+    """Checks that at least two cameras see the centres of some of the Gaussians, of which it takes 10,000."""
+    centres = np.asarray(gaussians.means[:: max(gaussians.count // 10_000, 1)], np.float64)
+    views = np.zeros(len(centres), int)
+    for camera in jax.tree.map(np.asarray, cameras):
+        x, y, z = camera.world_to_camera[:3, :3] @ centres.T + camera.world_to_camera[:3, 3:]
+        beside = np.abs(camera.fx * x + (camera.cx - camera.width / 2) * z) > FRUSTUM_MARGIN * camera.width / 2 * z
+        above = np.abs(camera.fy * y + (camera.cy - camera.height / 2) * z) > FRUSTUM_MARGIN * camera.height / 2 * z
+        views += (z > NEAR) & ~beside & ~above
+    share = float(np.mean(views >= 2)) if len(centres) else 0.0
+    if share < 0.01:
+        count = len(cameras.world_to_camera)
+        problem = f"{share:.1%} of {gaussians.count} points in the view of two or more of the {count} frames"
+        remedy = "Check that the poses belong to these frames, and the Gaussians to this capture."
+        raise InputError(where, problem, "views that overlap, and a scene in the world of their poses", remedy)
+
+
 def _fit_steps(options: Options, capture: Capture) -> float:
     """Steps of the photometric fit; those that `minutes` allow are estimated."""
     if options.minutes is None:
@@ -239,7 +279,7 @@ def _read_gaussians_of_capture(stage: StageInput) -> StageResult:
     transform = _near(path, _TRAINED)
     trained = None if transform is None else source_from_trained(transform)
     placed, note = place_in_capture(scene, capture, path, trained, stage.progress)
-    check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
+    _check_overlap(placed, capture.cameras[training_frames(capture.held_out)], str(path))
     return StageResult(placed, notes=(note, *read_notes))
 
 
@@ -252,7 +292,7 @@ def _fit_scene(stage: StageInput) -> StageResult:
     if start is None:
         started = capture if options.points is None else dataclasses.replace(capture, depths=None)
         start, origin = starting_gaussians(started, sh_degree=2, progress=stage.progress)
-        check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
+        _check_overlap(start, capture.cameras[training_frames(capture.held_out)], str(options.capture))
         notes = (f"start of the fit: {origin}",)
     pixels, minutes = capture.cameras.width * capture.cameras.height, options.minutes
     is_long = options.steps >= 3000 if minutes is None else minutes >= 3
@@ -267,7 +307,7 @@ def _fit_scene(stage: StageInput) -> StageResult:
         seconds=None if minutes is None else 60 * minutes,
         start=start,
         schedule=Schedule(sizes, most),
-        on_checkpoint=lambda current: stage.checkpoint.keep(lambda: current),
+        on_checkpoint=stage.checkpoint.keep,
         progress=stage.progress,
     )
     return StageResult(fitted, notes=(*notes, f"{fitted.count} Gaussians after {len(losses)} steps"))
@@ -339,7 +379,7 @@ def open_bare_scene(options: Options, progress: Progress) -> _BareScene:
     if options.cameras is not None:
         _, cameras, names = _load_poses(options.cameras, options.long_side)
         views = _Views(_moved(cameras, np.linalg.inv(source_from_scene)), names)
-        check_overlap(scene, views.cameras, str(options.cameras))
+        _check_overlap(scene, views.cameras, str(options.cameras))
         return _BareScene(scene, source_from_scene, views)
     refused, views = (), None
     if near is not None:

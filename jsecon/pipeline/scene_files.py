@@ -6,7 +6,6 @@ more with the photograph of the same camera than with the others. That holds for
 below that of a plain colour. A file does not record either over which colour the scene was trained: that is fitted.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,15 +19,12 @@ from scipy.spatial.transform import Rotation
 from jsecon.errors import InputError
 from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.resize import resize_frame, shrink_cameras
-from jsecon.numerics import FRUSTUM_MARGIN, NEAR
 from jsecon.pipeline.stages import WARNING
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
 from jsecon.read.splats.files import read_gaussians
-from jsecon.read.splats.points import gaussians_of_cloud
-from jsecon.splat.render import render_depth, render_rgb
-from jsecon.splat.sh import C0
+from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians
-from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.types import Capture, Gaussians, Progress
 
 
 def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
@@ -37,24 +33,6 @@ def read_scene(path: Path) -> tuple[Gaussians, tuple[str, ...]]:
     if not scene.count:
         raise InputError(path, "the file holds no Gaussians", "at least one", "Export the scene again.")
     return scene, notes
-
-
-def with_points(capture: Capture, path: Path, progress: Progress) -> Capture:
-    """Gives a capture the points of a cloud in the world of its files, and their depth if it has none of its own."""
-    cloud, notes = gaussians_of_cloud(path, 100_000)  # as many as a fit starts from with depth frames
-    scene = jax.tree.map(jnp.asarray, transform_gaussians(cloud, np.linalg.inv(capture.source_from_scene)))
-    train = np.flatnonzero(~np.asarray(capture.held_out))
-    check_overlap(scene, capture.cameras[train], str(path))
-    depths = capture.depths
-    if depths is None:
-        depths = np.zeros(capture.frames.shape[:3], np.float32)
-        for n, t in enumerate(train):
-            depth, alpha = map(np.asarray, render_depth(scene, capture.cameras[int(t)]))
-            depths[t] = np.where(alpha > 0.5, depth, 0)
-            progress(n + 1, len(train))
-    colours = np.rint(255 * np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)).astype(np.uint8)
-    given = {"points": np.asarray(scene.means), "point_colors": colours, "depths": depths}
-    return dataclasses.replace(capture, **given, notes=(*capture.notes, *notes))
 
 
 class _Placement(NamedTuple):
@@ -245,20 +223,3 @@ def _similarity(turn: np.ndarray, middle: np.ndarray, size: float) -> np.ndarray
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = turn / size, -middle / size
     return result
-
-
-def check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
-    """Checks that at least two cameras see the centres of some of the Gaussians, of which it takes 10,000."""
-    centres = np.asarray(gaussians.means[:: max(gaussians.count // 10_000, 1)], np.float64)
-    views = np.zeros(len(centres), int)
-    for camera in jax.tree.map(np.asarray, cameras):
-        x, y, z = camera.world_to_camera[:3, :3] @ centres.T + camera.world_to_camera[:3, 3:]
-        beside = np.abs(camera.fx * x + (camera.cx - camera.width / 2) * z) > FRUSTUM_MARGIN * camera.width / 2 * z
-        above = np.abs(camera.fy * y + (camera.cy - camera.height / 2) * z) > FRUSTUM_MARGIN * camera.height / 2 * z
-        views += (z > NEAR) & ~beside & ~above
-    share = float(np.mean(views >= 2)) if len(centres) else 0.0
-    if share < 0.01:
-        count = len(cameras.world_to_camera)
-        problem = f"{share:.1%} of {gaussians.count} points in the view of two or more of the {count} frames"
-        remedy = "Check that the poses belong to these frames, and the Gaussians to this capture."
-        raise InputError(where, problem, "views that overlap, and a scene in the world of their poses", remedy)

@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 import json
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NamedTuple
@@ -71,15 +70,6 @@ def _with_origin(field: LanguageField, folder: Path | None, **changes: Any) -> L
     if folder is not None:
         origin.folder = folder
     return dataclasses.replace(field, provenance=origin)
-
-
-def run_warnings(field: LanguageField) -> list[str]:
-    """What the run that made a field warned of: the first sentence of each warning."""
-    try:
-        warnings = parse_json(field.provenance or "{}").get("warnings", [])
-        return [re.split(r"(?<=\.) ", warning)[0] for warning in warnings]
-    except (ValueError, TypeError, AttributeError):  # not written by jsecon
-        return []
 
 
 def _given_points(options: Options) -> Path | None:

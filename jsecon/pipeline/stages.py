@@ -60,16 +60,6 @@ class ObjectLabels:
     """(P,) int32 node of each of these parts."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CastVotes:
-    """Votes, and the lists that they are the sum of."""
-
-    sum: Votes
-    """Weight of each region on each Gaussian."""
-    evidence: tuple[np.ndarray, ...]
-    """The list of each view, packed (`pack_evidence`); () without a ledger."""
-
-
 class Results:
     """Results of the finished stages, by the names of the stages. Reading one that is missing raises AttributeError."""
 
@@ -83,8 +73,8 @@ class Results:
     """R regions of the training frames"""
     parts: Regions | None = None
     """P parts of the regions; None where masks have no tree"""
-    votes: CastVotes
-    """weight of each region on each Gaussian"""
+    votes: tuple[Votes, tuple[np.ndarray, ...]]
+    """weight of each region on each Gaussian; and with a ledger the packed list of each view, of which it is the sum"""
     codes: Codes | None = None
     """codes of the paper, if the options ask for them"""
     held_out: Quality = Quality(np.zeros(0, int), np.zeros(0), np.zeros(0))
@@ -140,10 +130,10 @@ class Checkpoint:
             return cache.load(self._path)[0] if self._path.exists() else None
         return None
 
-    def keep(self, state: Callable[[], Any]) -> None:
+    def keep(self, state: Any) -> None:
         """Writes the state, at most every CHECKPOINT_SECONDS."""
         if time.monotonic() - self._last >= CHECKPOINT_SECONDS:
-            cache.save(self._path, state())
+            cache.save(self._path, state)
             self._last = time.monotonic()
 
     def remove(self) -> None:

@@ -14,7 +14,7 @@ from experiments.datasets.feature_files import load_features
 from experiments.tables import fill
 from experiments.tables.setting import levels_of, prepare
 from jsecon.read.masks.masks import LEVELS
-from jsecon.read.splats.files import save_gaussians
+from jsecon.read.splats.writing import save_gaussians
 from jsecon.splat.points import gaussians_from_points
 
 

@@ -35,7 +35,7 @@ from jsecon.read.captures.frames import (
     usable_images,
 )
 from jsecon.read.captures.images import image_header, read_depth, read_image
-from jsecon.read.captures.lens import Lens, operator_mask, resample_depth, undistorted_pinhole, undistortion_maps
+from jsecon.read.captures.lens import Lens, operator_mask, undistorted_pinhole, undistortion_maps
 from jsecon.types import Camera, Capture, ImageFile, Progress
 
 _MIN_DEPTH, _UNIT_STEP = 0.1, 1000.0
@@ -178,13 +178,22 @@ def _undistort(
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
+def _resample_depth(depth: Float[np.ndarray, "h w"], lens: Lens, other: Lens) -> Float[np.ndarray, "p q"]:
+    """Resamples a z-depth map for another pinhole lens at the same place: the nearest pixel, 0 outside."""
+    columns = np.floor((np.arange(other.width) + 0.5 - other.cx) / other.fx * lens.fx + lens.cx).astype(int)
+    rows = np.floor((np.arange(other.height) + 0.5 - other.cy) / other.fy * lens.fy + lens.cy).astype(int)
+    height, width = depth.shape
+    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+    return np.where(inside, depth[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)], 0)
+
+
 def _read_depth(
     file: Path, frame: _Frame, maps: tuple[np.ndarray, np.ndarray] | None, size: tuple[int, int], unit: float
 ) -> Float[np.ndarray, "h w"]:
     """The undistorted depth map at `size` (width, height), with `unit` for a world unit of the file."""
     lens, depth = frame.lens, read_depth(file, frame.posed.depth_unit * unit)
     if frame.posed.depth_lens is not None:
-        depth = resample_depth(depth, frame.posed.depth_lens, lens)
+        depth = _resample_depth(depth, frame.posed.depth_lens, lens)
     height, width = depth.shape
     if not same_aspect(frame.size, (width, height)):
         expected = f"the aspect of its image, {lens.width}x{lens.height}"

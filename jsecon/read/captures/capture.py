@@ -5,10 +5,11 @@ and poses in OpenCV axes. Other packages add readers by entry points in the grou
 """
 
 import contextlib
+import dataclasses
 import os
 import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
@@ -16,9 +17,9 @@ from jsecon.errors import InputError, join_first
 from jsecon.files import is_output_folder, list_files, reading
 from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
-from jsecon.read.captures.frames import FrameOptions, PosedImages
+from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages
 from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, unread_remedy
-from jsecon.read.captures.panoramas import cut_panoramas
+from jsecon.read.captures.lens import PANORAMA_VIEWS, Lens
 from jsecon.read.captures.video import is_video
 from jsecon.read.registry import SCENES, Reader, readers
 from jsecon.types import Capture, Progress
@@ -81,7 +82,29 @@ def read_posed_images(path: Path) -> PosedImages:
     with reading(path, remedy="Export the capture again."):
         if reader is None:
             raise _no_capture(path)
-        return cut_panoramas(reader.read(path))
+        return _cut_panoramas(reader.read(path))
+
+
+def _cut_view(panorama: PosedImage, lens: Lens, view: int) -> PosedImage:
+    """A view of a panorama."""
+    pose, path = panorama.world_to_camera.copy(), PurePosixPath(panorama.name)
+    pose[:3] = PANORAMA_VIEWS[view] @ pose[:3]
+    name = str(path.with_name(f"{path.stem}_{view}{path.suffix}"))
+    turned = dataclasses.replace(lens, view=view)
+    return dataclasses.replace(panorama, name=name, lens=turned, world_to_camera=pose, depth=None)
+
+
+def _cut_panoramas(posed: PosedImages) -> PosedImages:
+    """Replaces each panorama of a capture by its views, which share its file; their numbers follow its name."""
+    lenses = [(image, image.lens) for image in posed.images if image.lens is not None]
+    panoramas = [(image, lens) for image, lens in lenses if lens.panorama]
+    if not panoramas:
+        return posed
+    images = [image for image in posed.images if image.lens is None or not image.lens.panorama]
+    images += [_cut_view(*panorama, view) for panorama in panoramas for view in range(len(PANORAMA_VIEWS))]
+    each = f"{len(PANORAMA_VIEWS)} views each, of 95 degrees; what lies within 30 degrees of straight down is left out"
+    note = f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."
+    return dataclasses.replace(posed, images=images, notes=(*posed.notes, note))
 
 
 def _find_reader(path: Path) -> Reader | None:

@@ -10,9 +10,10 @@ Images are returned upright, as their EXIF orientation asks. If poses belong to 
 import contextlib
 import os
 import re
+import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import cv2
 import numpy as np
@@ -29,13 +30,16 @@ IMAGE_SUFFIXES += tuple(suffix.upper() for suffix in IMAGE_SUFFIXES)
 """suffixes tried, in this order, if a capture names an image without one"""
 MAX_PIXELS = 1 << 27
 """pixels of an image: 134 million"""
-Image.MAX_IMAGE_PIXELS = 2 * MAX_PIXELS  # Pillow warns of larger ones, whose header it has to read
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "AVIF", "HEIF")
 """Pillow's names of the formats that are read"""
 _UNREAD = re.compile(
     r".*\.(gif|exr|jxl|jp2|psd|hdr|tga|ppm|pgm|svg|dng|nef|cr2|cr3|arw|raf|orf|rw2)", re.IGNORECASE | re.DOTALL
 )
 """names of images that are not read; a camera's raw file is a TIFF whose first image is a thumbnail"""
+_PILLOW_WARNS = 2 * MAX_PIXELS
+"""pixels of an image of which Pillow warns: headers of smaller ones must be read"""
+_PILLOW_LIMIT = threading.Lock()
+"""held while Pillow's limit, one for the whole process, is _PILLOW_WARNS"""
 
 
 @contextlib.contextmanager
@@ -49,7 +53,7 @@ def _open(path: Path) -> Iterator[ImageFile]:
             with decoding(path, "pillow_heif") as heif:
                 heif.register_heif_opener()
         try:
-            image = Image.open(file, formats=_FORMATS)
+            image = _open_header(file)
         except (Image.UnidentifiedImageError, Image.DecompressionBombError) as error:
             raise ValueError("it is no image of a known kind and size" if head else "the file is empty") from error
         with image:
@@ -59,6 +63,16 @@ def _open(path: Path) -> Iterator[ImageFile]:
                 limit = f"{MAX_PIXELS // 10**6} million"
                 raise ValueError(f"its {image.width}x{image.height} pixels are more than {limit}: shrink it")
             yield image
+
+
+def _open_header(file: IO[bytes]) -> ImageFile:
+    """Opens an image by Pillow, also one of more than MAX_PIXELS; Pillow's own limit is back afterwards."""
+    with _PILLOW_LIMIT:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, _PILLOW_WARNS
+        try:
+            return Image.open(file, formats=_FORMATS)
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def unread_remedy(path: Path) -> str:
@@ -100,7 +114,7 @@ def _decode(path: Path, *, upright: bool = True, native: bool = False) -> tuple[
     """
     with _open(path) as image:
         if image.format == "PNG":
-            with Image.open(path) as copy:
+            with path.open("rb") as file, _open_header(file) as copy:
                 copy.verify()  # compares the checksums, and leaves an image that cannot be decoded
         orientation = _orientation(image)
         image.load()
@@ -155,18 +169,13 @@ def image_header(path: Path) -> _ImageHeader:
         return _ImageHeader((width, height), upright, orientation, image.mode)
 
 
-def read_pixels(path: Path, *, upright: bool = True) -> np.ndarray:
-    """Reads an image file without a conversion of its values: grey (H, W), RGB or RGBA (H, W, C)."""
-    return _decode(path, upright=upright)[0]
-
-
 def read_image(path: Path, *, upright: bool = True) -> UInt8[np.ndarray, "h w 3"]:
     """Reads an image file as RGB of 8 bits.
 
     Transparent pixels are blended with black, as in a render without background. A JPEG of more than MAX_PIXELS is
     decoded at half its size. `upright=False` returns the stored pixels.
     """
-    image = read_pixels(path, upright=upright)
+    image, _ = _decode(path, upright=upright)
     if image.dtype == np.uint16:
         image = cv2.convertScaleAbs(image, alpha=255 / 65535)  # rounds to nearest
     if image.dtype != np.uint8:
@@ -190,14 +199,6 @@ def write_image(path: str | Path, image: UInt8[np.ndarray, "h w 3"] | UInt[np.nd
 def encode_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, " b"]:
     """Encodes RGB as a JPEG of quality 90."""
     return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])[1].ravel()
-
-
-def decode_jpeg(data: UInt8[np.ndarray, " b"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Decodes what `encode_jpeg` encoded; ValueError if it is damaged."""
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if image is None:
-        raise ValueError("a picture is no JPEG")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def whole_numbers(array: np.ndarray) -> Int[np.ndarray, "..."]:
@@ -242,7 +243,7 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     remedy = "Write the depth in millimetres as a 16 bit PNG."
     with reading(path, expected, remedy, problem="the depth map cannot be read"):
         is_array = path.suffix.lower() == ".npy"
-        depth = map_npy(path) if is_array else read_pixels(path)
+        depth = map_npy(path) if is_array else _decode(path)[0]
         depth = depth[..., 0] if depth.ndim == 3 and depth.shape[2] == 1 else depth
         if depth.ndim != 2 or not depth.size or not (is_array or depth.dtype == np.uint16):
             raise ValueError(f"it has shape {depth.shape} of {depth.dtype}")

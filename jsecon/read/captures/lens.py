@@ -186,12 +186,3 @@ def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray
     target, _ = _opencv(pinhole)
     make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
     return make(matrix, coefficients, np.eye(3), target, (pinhole.width, pinhole.height), cv2.CV_32FC1)
-
-
-def resample_depth(depth: Float[np.ndarray, "h w"], lens: Lens, other: Lens) -> Float[np.ndarray, "p q"]:
-    """Resamples a z-depth map for another pinhole lens at the same place: the nearest pixel, 0 outside."""
-    columns = np.floor((np.arange(other.width) + 0.5 - other.cx) / other.fx * lens.fx + lens.cx).astype(int)
-    rows = np.floor((np.arange(other.height) + 0.5 - other.cy) / other.fy * lens.fy + lens.cy).astype(int)
-    height, width = depth.shape
-    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-    return np.where(inside, depth[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)], 0)

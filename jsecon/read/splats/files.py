@@ -1,4 +1,4 @@
-"""Gaussians read from and written to files of any known format, which the suffix of a file names, on the host.
+"""Gaussians read from files of any known format, which the suffix of a file names, on the host.
 
 `READERS` is the table of formats. A reader takes the file, and returns Gaussians (NumPy) in the world of the .ply that
 they were made from, and notes. Other packages add readers by entry points in the group jsecon.splats.
@@ -15,26 +15,22 @@ import gzip
 import struct
 import warnings
 import zipfile
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 
-from jsecon.errors import InputError, require_shape
+from jsecon.errors import InputError
 from jsecon.files import parse_json, reading
 from jsecon.read.registry import SCENES, Reader, decoding, readers
-from jsecon.read.splats.ply import read_ply, read_ply_file, require_drawable, save_ply
+from jsecon.read.splats.ply import read_ply, read_ply_file, require_drawable
 from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
-from jsecon.read.splats.usd import save_usda
-from jsecon.splat.project import check_gaussians, unusable_rows
+from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_gaussians
-from jsecon.types import Array, Gaussians
+from jsecon.types import Gaussians
 
 _FORMATS = f"Gaussians or points as {', '.join(SCENES[:-1])} or {SCENES[-1]}"
 MAX_READ_ROUNDING = 0.25
@@ -237,50 +233,3 @@ def read_gaussians(path: str | Path) -> tuple[Gaussians, tuple[str, ...]]:
         gaussians, notes = reader.read(path)
         gaussians, left_out = _without_unusable(path, gaussians)
         return gaussians, (*notes, *left_out)
-
-
-def save_gaussians(
-    path: str | Path,
-    gaussians: Gaussians,
-    *,
-    ids: Mapping[str, Int[Array, " n"]] = MappingProxyType({}),
-    names: Sequence[str] = (),
-    similarity: Float[Array, "4 4"] | None = None,
-) -> None:
-    """Writes Gaussians as a .ply (INRIA's layout, exact) or a .usda.
-
-    A .ply is written in blocks: memory-mapped arrays need not fit into memory. A .usda is a text of OpenUSD
-    with a ParticleField3DGaussianSplat for each object.
-
-    Args:
-      path: The file; its suffix names the format.
-      gaussians: N Gaussians.
-      ids: Integers of each Gaussian by name, such as "object_id", -1 for none: properties of a .ply. A .usda has a prim
-        for each "object_id".
-      names: Names of the objects by id, for a .usda.
-      similarity: (4, 4) transform into the world of the file.
-
-    Raises:
-      ValueError: Shapes disagree.
-      InputError: The format cannot be written, a Gaussian cannot be drawn, or the folder cannot be written.
-    """
-    path = Path(path)
-    require_writable_format(path)
-    check_gaussians(gaussians)
-    for name, column in ids.items():
-        require_shape(name, column, (gaussians.count,), "Give one id per Gaussian.")
-    if not gaussians.count and path.suffix.lower() != ".ply":
-        raise InputError(path, "there are no Gaussians to write", remedy="Write a .ply, which may be empty.")
-    if path.suffix.lower() == ".usda":
-        save_usda(path, gaussians, ids, similarity, names)
-    else:
-        save_ply(path, gaussians, ids, similarity)
-
-
-def require_writable_format(path: Path, points: bool = False) -> None:
-    """Checks that `save_gaussians`, or `save_point_cloud`, can write a file, which need not exist."""
-    known = (".las", ".laz", ".ply") if points else (".ply", ".usda")
-    if path.suffix.lower() not in known:
-        command = f"npx @playcanvas/splat-transform {path.stem}.ply {path.stem}.glb"
-        remedy = f"Write {path.stem}.ply. To make a .glb, .spz or .sog of it, run: {command}"
-        raise InputError(path, f"its name ends in {path.suffix or 'no suffix'}", " or ".join(known), remedy)

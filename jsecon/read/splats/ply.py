@@ -1,4 +1,4 @@
-"""Gaussians as .ply files, and vertices of any kind, on the host.
+"""Gaussians read from .ply files, and vertices of any kind, on the host.
 
 The container is read whatever its properties: text or binary, either byte order, lists (http://paulbourke.net/
 dataformats/ply). The package plyfile is not used: it is under GPLv3+ and jsecon under Apache-2.0. Gaussians have the
@@ -9,31 +9,27 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
-from jaxtyping import Float, Int
 
 from jsecon.errors import InputError
-from jsecon.files import atomic_write, scratch_array
+from jsecon.files import scratch_array
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
-from jsecon.splat.transform import float32_rounding, transform_gaussians
-from jsecon.types import Array, Gaussians
+from jsecon.types import Gaussians
 
 BLOCK_ROWS = 1 << 18
 """Number of Gaussians read or transformed at a time."""
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 """format of a .ply -> NumPy's byte order"""
-_TYPES = dict(char="i1", uchar="u1", short="i2", ushort="u2", int="i4", uint="u4", float="f4", double="f8")
-_TYPES |= {np.dtype(kind).name: kind for kind in _TYPES.values()}
+TYPES = dict(char="i1", uchar="u1", short="i2", ushort="u2", int="i4", uint="u4", float="f4", double="f8")
+TYPES |= {np.dtype(kind).name: kind for kind in TYPES.values()}
 """a property's type, by its old name or with its size (uchar, uint8) -> NumPy's"""
-_POSITION, _OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blue")
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_SCALE = ("scale_0", "scale_1", "scale_2")
-_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+POSITION, OPACITY, _RGB = ("x", "y", "z"), ("opacity",), ("red", "green", "blue")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
 @dataclasses.dataclass
@@ -82,9 +78,9 @@ def _parse_header(data: memoryview) -> _Header:
                     elements.append(_Element(name, int(count), [], {}))
                 case ["property", "list", length, item, name]:
                     elements[-1].fields.append((name, "list"))
-                    elements[-1].lists[name] = _TYPES[length], _TYPES[item]
+                    elements[-1].lists[name] = TYPES[length], TYPES[item]
                 case ["property", kind, name]:
-                    elements[-1].fields.append((name, _TYPES[kind]))
+                    elements[-1].fields.append((name, TYPES[kind]))
                 case _:
                     raise ValueError(line)
         except (IndexError, KeyError, ValueError) as error:
@@ -146,10 +142,10 @@ def read_ply(path: Path) -> Gaussians:
     """
     table = read_vertices(path)
     count, names = len(table), table.dtype.names or ()
-    scales = _SCALE if "scale_2" in names else _SCALE[:2]
-    has_rgb = not set(_DC) & set(names) and all(name in names and table.dtype[name] == np.uint8 for name in _RGB)
-    colours = _RGB if has_rgb else _DC
-    if missing := [name for name in (*_POSITION, *colours, *_OPACITY, *scales, *_ROTATION) if name not in names]:
+    scales = SCALE if "scale_2" in names else SCALE[:2]
+    has_rgb = not set(DC) & set(names) and all(name in names and table.dtype[name] == np.uint8 for name in _RGB)
+    colours = _RGB if has_rgb else DC
+    if missing := [name for name in (*POSITION, *colours, *OPACITY, *scales, *ROTATION) if name not in names]:
         layout = "3D Gaussians in INRIA's layout (x y z, f_dc_0..2, opacity, scale_0..2, rot_0..3)"
         raise ValueError(f"its vertices have no {', '.join(missing)}, expected {layout}")
     rest = sum(name.startswith("f_rest_") for name in names)
@@ -157,18 +153,18 @@ def read_ply(path: Path) -> Gaussians:
     if rest not in (0, 9, 24, 45) or any(name not in names for name in rest_names):
         raise ValueError(f"its vertices have {rest} properties f_rest, expected 0, 9, 24 or 45 (degree 0 to 3)")
     filters = [name for name in names if name.lower() == "filter_3d"][:1]
-    exact = all(np.can_cast(table.dtype[name], np.float32) for name in _POSITION)
+    exact = all(np.can_cast(table.dtype[name], np.float32) for name in POSITION)
     means = np.empty((count, 3), np.float32 if exact else np.float64)
     log_scales, quaternions, logits = (np.empty((count, *shape), np.float32) for shape in ((3,), (4,), ()))
     sh = scratch_array((count, 1 + rest // 3, 3), np.float32)
     for first in range(0, count, BLOCK_ROWS):
         rows = slice(first, first + BLOCK_ROWS)
         vertices = table[rows]
-        means[rows] = _columns(vertices, _POSITION, means.dtype.type)
+        means[rows] = _columns(vertices, POSITION, means.dtype.type)
         log_scales[rows, 2] = -np.inf
         log_scales[rows, : len(scales)] = _columns(vertices, scales)
-        quaternions[rows] = _columns(vertices, _ROTATION)
-        logits[rows] = _columns(vertices, _OPACITY)[:, 0]
+        quaternions[rows] = _columns(vertices, ROTATION)
+        logits[rows] = _columns(vertices, OPACITY)[:, 0]
         first_band = _columns(vertices, colours)
         sh[rows, 0] = (first_band / 255 - 0.5) / C0 if has_rgb else first_band
         sh[rows, 1:] = _columns(vertices, rest_names).reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
@@ -194,18 +190,6 @@ def _fuse_filter(log_scales: np.ndarray, logits: np.ndarray, deviation: np.ndarr
     logits[:] = np.log(opacity) - np.log1p(-opacity)
 
 
-def usable_blocks(
-    path: Path, gaussians: Gaussians, similarity: Float[Array, "4 4"] | None
-) -> Iterator[tuple[slice, Gaussians]]:
-    """Yields the rows of a block, and its Gaussians in the (4, 4) transformed world of the file that is written.
-
-    The Gaussians may be memory-mapped. A Gaussian that cannot be drawn is an error: `load_gaussians` would refuse it.
-    """
-    for rows, block in _transform_blocks(gaussians, similarity):
-        require_drawable(path, block, rows.start, "Remove these Gaussians first.")
-        yield rows, block
-
-
 def require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy: str) -> None:
     """Raises InputError if a Gaussian, counted from `first`, cannot be drawn."""
     for name, array in vars(gaussians).items():
@@ -216,85 +200,3 @@ def require_drawable(path: str | Path, gaussians: Gaussians, first: int, remedy:
                 f"{name} of {rows.sum()} of {len(rows)} Gaussians are {state} (the first: {first + rows.argmax()})"
             )
             raise InputError(path, problem, remedy=remedy)
-
-
-def save_ply(
-    path: Path,
-    gaussians: Gaussians,
-    ids: Mapping[str, Int[Array, " n"]],
-    similarity: Float[Array, "4 4"] | None,
-) -> None:
-    """Writes Gaussians in INRIA's layout: binary little endian float32, normals zero, f_rest channel-major.
-
-    Float32 Gaussians come back bit by bit. Positions are written in float64 if float32 would not hold them (coordinates
-    of a map projection). Ids are further properties, int32, which other readers skip.
-    """
-    rest_names = (f"f_rest_{index}" for index in range(3 * (gaussians.sh.shape[1] - 1)))
-    names = (*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, *_OPACITY, *_SCALE, *_ROTATION)
-    is_double = needs_float64(gaussians, similarity)
-    kinds = ("double" if is_double and name in _POSITION else "float" for name in names)
-    properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
-    properties += [f"property int {name}" for name in ids]
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(gaussians.count, properties))
-        for rows, block in usable_blocks(path, gaussians, similarity):
-            own = {name: np.asarray(column[rows]) for name, column in ids.items()}
-            file.write(_table(block, is_double, own).tobytes())  # tofile hides a full disk
-
-
-def _header(count: int, properties: list[str]) -> bytes:
-    start = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    return "\n".join([*start, *properties, "end_header\n"]).encode()
-
-
-def _transform_blocks(
-    gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None
-) -> Iterator[tuple[slice, Gaussians]]:
-    """Transforms Gaussians in blocks of BLOCK_ROWS rows; memory-mapped columns need not fit into memory.
-
-    Yields:
-      The rows of each block, and its Gaussians (NumPy); without a similarity they are copied.
-    """
-    for first in range(0, gaussians.count, BLOCK_ROWS):
-        rows = slice(first, min(first + BLOCK_ROWS, gaussians.count))
-        part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
-        yield rows, part if similarity is None else transform_gaussians(part, similarity)
-
-
-def needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None = None) -> bool:
-    """Whether float32 would round centres by over 0.02 of the largest standard deviation of 1 in 100 Gaussians.
-
-    `similarity` is applied first. False for float32 centres without it.
-    """
-    if similarity is None and gaussians.means.dtype != np.float64:
-        return False
-    bare = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
-    far = sum(int((float32_rounding(block) > 0.02).sum()) for _, block in _transform_blocks(bare, similarity))
-    return far > 0.01 * gaussians.count
-
-
-def _table(block: Gaussians, is_double: bool, ids: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The rows of a file."""
-    sh = np.asarray(block.sh, np.float32)
-    count = len(sh)
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (sh.shape[1] - 1))
-    normals, opacity = np.zeros((count, 3)), np.asarray(block.opacity_logits)[:, None]
-    columns = [normals, sh[:, 0], rest, opacity, block.log_scales, block.quaternions]
-    others = np.concatenate([np.asarray(column, "<f4") for column in columns], axis=1)
-    last = [(name, "<i4") for name in ids]
-    kinds = [("means", "<f8" if is_double else "<f4", 3), ("others", "<f4", others.shape[1]), *last]
-    rows = np.empty(count, kinds)
-    rows["means"], rows["others"] = block.means, others
-    for name, column in ids.items():
-        rows[name] = column
-    return rows
-
-
-def write_vertices(path: Path, columns: Sequence[tuple[str, str, np.ndarray]]) -> None:
-    """Writes a .ply of vertices: names, types (a .ply's words) and columns of their properties."""
-    rows = np.empty(len(columns[0][2]), [(name, "<" + _TYPES[kind]) for name, kind, _ in columns])
-    for name, _, column in columns:
-        rows[name] = column
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(rows), [f"property {kind} {name}" for name, kind, _ in columns]))
-        file.write(rows.tobytes())

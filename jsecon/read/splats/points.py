@@ -21,7 +21,8 @@ from jaxtyping import Int, UInt8
 from jsecon.errors import InputError
 from jsecon.files import atomic_write, read_lines, reading
 from jsecon.read.registry import Reader, decoding
-from jsecon.read.splats.ply import read_vertices, write_vertices
+from jsecon.read.splats.ply import read_vertices
+from jsecon.read.splats.writing import write_vertices
 from jsecon.splat.points import gaussians_from_points, voxel_means
 from jsecon.types import Gaussians
 
