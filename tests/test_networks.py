@@ -13,7 +13,7 @@ from clip_files import COLOURS, write_clip, write_visual
 from hub_server import Repository, files_in, running_hub, use_hub
 from sam2_files import write_sam2
 from sam_files import write_sam
-from test_pipeline import Recorder, again, skipped
+from test_pipeline import Recorder, again
 
 from jsecon import Scene, load_capture, load_field, save_gaussians
 from jsecon.fit.start import starting_gaussians
@@ -61,7 +61,7 @@ def seen(room, splat, models, tmp_path_factory):
 def test_a_run_with_sam_and_clip_finds_things_by_their_names(seen):
     run, folder, console = seen
     assert "proposals of level m by sam" in console.planned["objects"].why
-    assert skipped(run)["photometric fit"].endswith("(scene.ply)")
+    assert console.planned["gaussians"].why.endswith("scene.ply")
     field = load_field(folder / "field.safetensors")
     assert field.embedder.startswith("clip-")
     assert field.regions.count >= 4

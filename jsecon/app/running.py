@@ -97,7 +97,6 @@ def _write_run(
         "size": [run.capture.cameras.width, run.capture.cameras.height],
         **_quality(run.held_out, console),
         "seconds": {name: round(value, 2) for name, value in run.seconds.items()},
-        "skipped": {step.name: step.why for step in run.steps if step.status == "skipped"},
         "notes": list(run.notes),
         "peak_memory_mib": round(peak_memory_mib(), 1),
         **figures,

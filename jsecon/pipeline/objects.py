@@ -63,11 +63,9 @@ def _plan_labels(context: RunContext) -> Stage:
         problem = "no segmenter finds masks that consensus associates, and other masks have no time limit"
         raise InputError("--vision-minutes", problem, remedy="Leave it out, or name a --segmenter.")
     if folder is not None:
-        reason = f"masks are given ({folder.name})"
-        skipped = {"segmenter": reason, "association": reason}
         key_options |= context.key_options("level")
         how, read = f"read from {folder.name}", _read_masks
-        return Stage("objects", how, read, after=("load",), key_options=key_options, files=(folder,), skipped=skipped)
+        return Stage("objects", how, read, after=("load",), key_options=key_options, files=(folder,))
     if options.proposals is not None:
         how = f"proposals read from {options.proposals.name}"
         key_options |= context.key_options("level")

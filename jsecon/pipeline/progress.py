@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, TypeAlias
 
-Status: TypeAlias = Literal["run", "cached", "skipped"]
+Status: TypeAlias = Literal["run", "cached"]
 
 QUIET_SECONDS = 2.0
 """s; shorter steps show no progress"""
@@ -15,14 +15,14 @@ QUIET_SECONDS = 2.0
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """A stage of a run, or a part of a stage that the run leaves out."""
+    """A stage of a run."""
 
     name: str
-    """Name of the stage or part."""
+    """Name of the stage."""
     status: Status
-    """Whether it runs, is read from the cache, or is left out."""
+    """Whether it runs or is read from the cache."""
     why: str
-    """How it is computed, or why it is left out."""
+    """How it is computed."""
 
 
 class Console:

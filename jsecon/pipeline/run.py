@@ -1,7 +1,7 @@
 """A run: from a capture to a language field, stage by stage, each stored as it is finished.
 
-The keys of all stages are known before any runs, so the plan is printed first: which stages run, which are cached, what
-is skipped and why. `stages` has the table of the stages.
+The keys of all stages are known before any runs, so the plan is printed first: which stages run, and which are
+cached. `stages` has the table of the stages.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ class _RunState:
     paths: dict[str, Path]
     """Cache file of each stage."""
     steps: list[Step]
-    """Stages, and what was skipped."""
+    """The stages."""
     results: Results = dataclasses.field(default_factory=Results)
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Wall time of each stage, also of one that was computed in an earlier run."""
@@ -94,7 +94,7 @@ class Run:
     held_out: Quality
     """PSNR and SSIM of the held-out frames."""
     steps: list[Step]
-    """Stages, and what was skipped."""
+    """The stages."""
     seconds: dict[str, float]
     """Wall time of each stage, also of one that was computed in an earlier run."""
     notes: list[str]
@@ -119,7 +119,6 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
         keys[stage.name] = stage.key(keys, context.out)
     paths = {name: context.out / "cache" / f"{name}-{key}.safetensors" for name, key in keys.items()}
     steps = [Step(stage.name, "cached" if paths[stage.name].exists() else "run", stage.how) for stage in stage_list]
-    steps += [Step(part, "skipped", why) for stage in stage_list for part, why in stage.skipped.items()]
     return _RunState(keys, paths, steps)
 
 

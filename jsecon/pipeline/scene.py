@@ -121,17 +121,15 @@ def _plan_rendered_views(context: RunContext) -> Stage:
     """Plans the stage "load" of a scene without photographs."""
     options, near = context.options, _poses_near(context.options)
     files = (options.capture, options.cameras, near, near and _near(options.capture, _TRAINED))
-    skipped = {"photographs": "the scene comes without any", "held_out": "no photograph to compare with"}
     key_options = context.key_options("views", "up", "long_side")
     if options.cameras is not None:
         how = f"the scene rendered from the poses of {options.cameras.name}"
         key_options = context.key_options("long_side")
-        skipped["planned views"] = f"the poses are given ({options.cameras.name})"
     elif near is not None:
         how = f"{_NEAR_VIEWS} of the poses of {near}, or planned views if these do not show {options.capture.name}"
     else:
         how = f"{options.views or DEFAULT_VIEWS} virtual views, planned from the Gaussians of {options.capture.name}"
-    return Stage("load", how, _render_views, key_options=key_options, files=files, skipped=skipped)
+    return Stage("load", how, _render_views, key_options=key_options, files=files)
 
 
 def _near(scene: Path, *names: str) -> Path | None:
@@ -165,10 +163,9 @@ def _plan_gaussians(context: RunContext) -> Stage:
         return Stage("gaussians", how, _fit_scene, after=("load",), key_options=key_options)
     transform = None if bare else _near(path, _TRAINED)
     key_options = {} if transform is None else {"trained": transform.read_text(errors="replace")}
-    skipped = {"photometric fit": f"the scene's Gaussians are given ({path.name})"}
     read = _read_bare_scene if bare else _read_gaussians_of_capture
     how = f"read from {path.name}"
-    return Stage("gaussians", how, read, after=("load",), key_options=key_options, files=(path,), skipped=skipped)
+    return Stage("gaussians", how, read, after=("load",), key_options=key_options, files=(path,))
 
 
 def _estimate_poses(stage: StageInput) -> StageResult:

@@ -167,8 +167,6 @@ class Stage:
     """Options and models that the result depends on; models by their content, not by the place of files."""
     files: tuple[Path | None, ...] = ()
     """Input files and folders; None for one that the options do not name."""
-    skipped: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Parts that the options make needless, each with the reason."""
     distributed: bool = False
     """Whether several processes compute it together, each a part of the views."""
 
