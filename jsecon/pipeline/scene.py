@@ -26,7 +26,7 @@ from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_scene
 from jsecon.pipeline.stages import WARNING, RunContext, Stage, StageInput, StageResult, training_frames
 from jsecon.poses.sfm import find_poses
-from jsecon.read.captures.capture import has_depth, load_capture, read_posed_images, unposed_photographs
+from jsecon.read.captures.capture import find_panoramas, has_depth, load_capture, read_posed_images, unposed_photographs
 from jsecon.read.captures.frames import (
     FrameOptions,
     PosedImages,
@@ -37,8 +37,7 @@ from jsecon.read.captures.frames import (
 )
 from jsecon.read.captures.lens import undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
-from jsecon.read.captures.panoramas import find_panoramas, has_mark
-from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, is_video, read_header, write_frames
+from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, has_panorama_mark, is_video, write_frames
 from jsecon.read.splats.points import gaussians_of_cloud
 from jsecon.splat.render import render_depth
 from jsecon.splat.sh import C0
@@ -91,7 +90,7 @@ def plan_capture(context: RunContext) -> list[Stage]:
 
 def _frames_of_video(options: Options) -> tuple[int, bool]:
     """How many frames of a video are taken, and whether they are panoramas, of which each shows more."""
-    is_round = options.panoramas or has_mark(read_header(options.capture))
+    is_round = options.panoramas or has_panorama_mark(options.capture)
     return options.frames or DEFAULT_VIDEO_FRAMES // (3 if is_round else 1), is_round
 
 

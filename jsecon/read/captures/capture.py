@@ -19,8 +19,8 @@ from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages
 from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, unread_remedy
-from jsecon.read.captures.lens import PANORAMA_VIEWS, Lens
-from jsecon.read.captures.video import is_video
+from jsecon.read.captures.lens import PANORAMA_VIEWS, Lens, panorama_lens
+from jsecon.read.captures.video import has_panorama_mark, is_video
 from jsecon.read.registry import SCENES, Reader, readers
 from jsecon.types import Capture, Progress
 
@@ -185,6 +185,24 @@ def unposed_photographs(path: Path) -> tuple[list[Path], tuple[str, ...]]:
     if photos and (above := _capture_above(path)) is not None:
         raise InputError(path, f"its photographs are part of a {above[1]} capture", remedy=f"Give that: {above[0]}")
     return photos, _notes_beside(path, photos, others) if photos else ()
+
+
+def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path], tuple[str, ...]]:
+    """Finds the panoramas among photographs, by marks in their files or as the user `declared` all to be, and notes.
+
+    A panorama is twice as wide as high.
+    """
+    found, unmarked = [], 0
+    for photo in photos:
+        width, height = image_header(photo).upright
+        if declared:
+            panorama_lens(photo, width, height)  # refuses another aspect
+        if width == 2 * height:
+            is_found = declared or has_panorama_mark(photo)
+            found += [photo] if is_found else []
+            unmarked += not is_found
+    note = f"{unmarked} photographs are twice as wide as high, but their files do not call them panoramas."
+    return found, (f"{note} Give --panoramas if they show all directions.",) if unmarked else ()
 
 
 def lone_photographs(path: Path) -> list[Path]:

@@ -16,6 +16,8 @@ from jsecon.files import reading
 from jsecon.read.captures.images import write_image
 from jsecon.types import Progress
 
+_MARK = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*equirectangular|sv3d.{0,200}?equi", re.DOTALL)
+"""of a panorama: of XMP (GPano), and of Google's spherical video, versions 1 and 2"""
 DEFAULT_VIDEO_FRAMES = 150
 """frames taken by default: two or three rounds about a table top"""
 _COUNTED = (".mp4", ".mov", ".m4v", ".avi", ".3gp")
@@ -71,7 +73,14 @@ def _missing_notes(video: Path, count: int, end: int, total: int) -> tuple[str, 
     return (f"{note} The others are used; copy the video again to have all.",) if failed else ()
 
 
-def read_header(video: Path) -> bytes:
+def has_panorama_mark(path: Path) -> bool:
+    """Whether the first bytes of an image, or the header of a video, say that it is equirectangular."""
+    with path.open("rb") as file:
+        head = _read_header(path) if is_video(path) else file.read(1 << 18)
+    return _MARK.search(head) is not None
+
+
+def _read_header(video: Path) -> bytes:
     """The first and the last bytes of a video: what describes it lies before or behind the pixels."""
     with video.open("rb") as file:
         head = file.read(1 << 16)
@@ -82,7 +91,7 @@ def read_header(video: Path) -> bytes:
 def _colour_notes(video: Path) -> tuple[str, ...]:
     """Says that colours are off if a video is HDR, which OpenCV decodes as if it were not."""
     # Of ISO/IEC 23091-2's transfer characteristics, 16 is PQ (HDR10, Dolby Vision) and 18 is HLG.
-    header = read_header(video)
+    header = _read_header(video)
     boxes, matroska = rb"colr(?:nclx|nclc)..\0[\x10\x12]", rb"\x55\xba\x81[\x10\x12]"
     if not re.search(boxes, header, re.DOTALL) and not re.search(matroska, header[: 1 << 16]):
         return ()
