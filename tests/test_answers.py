@@ -96,7 +96,7 @@ def test_answers_without_a_region_or_gaussians_and_a_text_that_is_not_utf8(saved
 
 def test_an_answer_of_nothing_repeats_what_the_run_warned_of(saved, tmp_path):
     warning = "9 of 12 views show hardly any detail."
-    told = provenance(Options(tmp_path), {}, "", tmp_path, [f"{warning} Give others."])
+    told = provenance(Options(tmp_path), {}, tmp_path, [f"{warning} Give others."])
     scene = Scene(dataclasses.replace(saved[0], provenance=told), ColourEmbedder())
     absent, present = scene.ask("red but not red"), scene.ask("red", min_rank=0)
     assert f"no region matches it; the run warned: {warning[:-1]}, no Gaussian is selected" in str(absent)

@@ -20,7 +20,7 @@ from jsecon.app.server import application
 from jsecon.change import detect
 from jsecon.change.detect import _depth_cost, object_changes
 from jsecon.change.history import events
-from jsecon.field.evidence import pack_evidence, plan_evidence
+from jsecon.field.evidence import pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row
 from jsecon.field.ledger_file import save_with_ledger
 from jsecon.read.captures.capture import taken_on
@@ -99,7 +99,7 @@ def field_with_ledger(gaussians, labels, eyes, frames):
     for name, camera, frame in zip(("a", "b", "c"), eyes, frames):
         shares = np.asarray(render(gaussians, camera, things, depth=True).features)
         image = np.where(shares.max(-1) > 0.5, shares.argmax(-1), -1)
-        evidence = pack_evidence(plan_evidence(gaussians, camera)(image, 3), 3)
+        evidence = pack_evidence(view_evidence(gaussians, camera, image, 3), 3)
         shown, pixels = np.unique(image[image >= 0], return_counts=True)
         rows = embedder.embed_regions(frame, image[None] == shown[:, None, None])
         pixels = np.stack([shown, pixels]).astype(np.int32)

@@ -15,7 +15,7 @@ from test_field import assert_same
 
 from jsecon.app.scene import open_scene
 from jsecon.errors import InputError
-from jsecon.field.evidence import _unpack_evidence, pack_evidence, plan_evidence, region_votes
+from jsecon.field.evidence import _unpack_evidence, pack_evidence, region_votes, view_evidence
 from jsecon.field.field import load_field
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row, forget_views
 from jsecon.field.ledger_file import _ledger_file, load_ledger, save_with_ledger
@@ -61,7 +61,7 @@ def run_on(scene, cameras, labels, rows, chosen):
 def views(scene, cameras, labels, rows):
     made = {}
     for t, name in enumerate(NAMES):
-        evidence = pack_evidence(plan_evidence(scene, cameras[t])(labels[t], REGIONS), REGIONS)
+        evidence = pack_evidence(view_evidence(scene, cameras[t], labels[t], REGIONS), REGIONS)
         shown, pixels = np.unique(labels[t][labels[t] >= 0], return_counts=True)
         counts, picture = np.stack([shown, pixels]).astype(np.int32), np.full(300, 17 * t + 3, np.uint8)
         made[name] = LedgerView(evidence, counts, counts[0], rows[t, shown], camera_row(cameras[t]), picture)
@@ -102,7 +102,7 @@ def test_regions_that_a_field_lacks_are_added(scene, cameras, labels, rows, view
 
 
 def test_packing_a_view_loses_nothing(scene, camera, labels):
-    evidence = plan_evidence(scene, camera)(labels[0], REGIONS)
+    evidence = view_evidence(scene, camera, labels[0], REGIONS)
     packed = pack_evidence(evidence, REGIONS)
     for a, b in zip(_unpack_evidence(packed, scene.count, REGIONS), evidence):
         np.testing.assert_array_equal(a, b)

@@ -12,7 +12,7 @@ from reference import weights_reference
 from jsecon import plan_view
 from jsecon.errors import InputError
 from jsecon.field import columns, evidence
-from jsecon.field.evidence import IGNORED, plan_evidence, region_votes, sum_evidence
+from jsecon.field.evidence import IGNORED, region_votes, sum_evidence, view_evidence
 from jsecon.field.membership import normalise_votes
 from jsecon.splat import visible
 from jsecon.splat.render import render_rgb
@@ -102,7 +102,7 @@ def test_inside_a_trace_they_are_the_same_also_under_vmap(cast, scene, cameras, 
 
 def test_no_order_of_views_changes_a_bit(cast, scene, cameras, labels):
     """Nor do parts that are added up apart: each is exact."""
-    views = [plan_evidence(scene, cameras[t])(labels[t], REGIONS) for t in range(4)]
+    views = [view_evidence(scene, cameras[t], labels[t], REGIONS) for t in range(4)]
     order = [2, 0, 3, 1]
     turned = sum_evidence([views[t] for t in order], scene.count, REGIONS, top=REGIONS, by_view=True)
     assert_same_bits(turned, cast, COLUMNS)

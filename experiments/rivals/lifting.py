@@ -21,7 +21,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from experiments.rivals.evidence import Evidence, local_masks
-from jsecon.field.evidence import plan_evidence
+from jsecon.field.evidence import view_evidence
 from jsecon.paper.queries import _relevancies
 from jsecon.splat.fusion import compute_once
 from jsecon.splat.plan import ViewPlan, plan_view
@@ -73,7 +73,7 @@ def train_backprojection(evidence: Evidence) -> Lifted:
     blocks = []
     for t, image in enumerate(local):
         count = int(image.max()) + 1
-        cast = plan_evidence(gaussians, cameras[t])(image, count).matrix(gaussians.count, count)[:, :count].tocoo()
+        cast = view_evidence(gaussians, cameras[t], image, count).matrix(gaussians.count, count)[:, :count].tocoo()
         blocks.append((cast.data, cast.row, names[t][cast.col]))
     return _lifted(_sparse(blocks, evidence), evidence)
 

@@ -180,10 +180,17 @@ def list_evidence(
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
 
     def view(t: int) -> tuple:  # a plain one, which processes can exchange
-        evidence = plan_evidence(gaussians, cameras[t], **options)(np.asarray(labels[t]), num_regions)
+        evidence = view_evidence(gaussians, cameras[t], np.asarray(labels[t]), num_regions, **options)
         return tuple(evidence if folder is None else _on_disk(evidence, folder / str(t)))
 
     return [ViewEvidence(*evidence) for evidence in map_views(len(labels), view, progress)]
+
+
+def view_evidence(
+    gaussians: Gaussians, camera: Camera, labels: Shaped[np.ndarray, "h w"], num_regions: int, **options: Any
+) -> ViewEvidence:
+    """Lists what one view casts on N Gaussians; options as for `region_votes`. Host code."""
+    return plan_evidence(gaussians, camera, **options)(labels, num_regions)
 
 
 def plan_evidence(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 from scipy.spatial import KDTree
 
-from jsecon.field.evidence import MAX_WHOLE, each_view, plan_evidence
+from jsecon.field.evidence import MAX_WHOLE, each_view, view_evidence
 from jsecon.splat.capacity import plan_capacity
 from jsecon.splat.render import render_depth
 from jsecon.splat.visible import hide, visible_part
@@ -133,7 +133,7 @@ def _view(
     nearest = float(depth[shown].min(initial=np.inf))
     bins = np.where(shown, np.log(np.where(shown, depth, 1) / nearest) / np.log1p(_STEP), -1).astype(np.int32)
     regions = int(bins.max(initial=-1)) + 1
-    found = plan_evidence(gaussians, camera, capacity=capacity)(bins, regions)
+    found = view_evidence(gaussians, camera, bins, regions, capacity=capacity)
     rows, pose = found.gaussians, np.asarray(camera.world_to_camera, np.float32)
     own = np.repeat(np.arange(len(rows)), np.diff(found.starts))
     middles = np.append(nearest * (1 + _STEP) ** (np.arange(regions) + 0.5), 0)  # the last is that of no surface

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, Shaped
 from scipy.spatial import KDTree
 
 from jsecon.errors import InputError
-from jsecon.field.evidence import MAX_WHOLE, each_view, plan_evidence
+from jsecon.field.evidence import MAX_WHOLE, each_view, view_evidence
 from jsecon.fit.resize import scale_cameras
 from jsecon.parallel import map_over_processes, map_views
 from jsecon.types import Camera, Gaussians, Progress
@@ -320,7 +320,7 @@ def _weights_by_view(
         gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
 
     def view(t: int) -> tuple[np.ndarray, float, float]:
-        evidence = plan_evidence(gaussians, cameras[t], near=0.01 * diagonal)(whole, 1)
+        evidence = view_evidence(gaussians, cameras[t], whole, 1, near=0.01 * diagonal)
         weights = np.zeros(gaussians.count, np.float32)
         weights[evidence.gaussians] = evidence.weights  # one entry each
         shown = weights[counted.sample]
@@ -347,7 +347,7 @@ def frames_by_need(
     whole = np.zeros((cameras.height, cameras.width), np.int32)
 
     def shown(t: int) -> Float[np.ndarray, " n"]:
-        weights = plan_evidence(gaussians, cameras[t])(whole, 1).matrix(gaussians.count, 1).sum(1)
+        weights = view_evidence(gaussians, cameras[t], whole, 1).matrix(gaussians.count, 1).sum(1)
         return np.minimum(np.asarray(weights, np.float32)[counted, 0] / SEEN_PX, 1)
 
     looks = np.stack(map_views(len(cameras), shown, progress))

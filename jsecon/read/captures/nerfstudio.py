@@ -69,8 +69,8 @@ def _read_nerfstudio(path: Path) -> PosedImages:
 def _read_inria(file: Path, cameras: list[Any]) -> PosedImages:
     """The cameras of INRIA's cameras.json: position and rotation are camera-to-world, in OpenCV axes."""
     images = []
-    with reading(file, remedy="Copy it again from the folder of the training.", problem="a camera is wrong"):
-        for camera in cameras:
+    for index, camera in enumerate(cameras):
+        with reading(file, remedy="Copy it again from the folder of the training.", problem=f"camera {index} is wrong"):
             name, pose = str(camera["img_name"]), np.eye(4)
             pose[:3] = np.column_stack([camera["rotation"], camera["position"]])
             width, height, fx, fy = (_number(camera, key, 0.0) for key in ("width", "height", "fx", "fy"))
