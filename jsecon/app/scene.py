@@ -40,7 +40,7 @@ from jsecon.networks.hub import parse_model
 from jsecon.paper.queries import CODE_THRESHOLD
 from jsecon.pipeline.options import Options, read_date
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.sources import locate_sources, move_hints
+from jsecon.pipeline.sources import forget_warnings, locate_sources, move_hints
 from jsecon.process import MEMORY, memory_budget
 from jsecon.query.answer import answer_question, trim
 from jsecon.query.expressions import is_expression, parse_query, split_part
@@ -296,7 +296,8 @@ class Scene:
             names = {self.field.names[frame_index(self.field, frame)] for frame in frames}
             if names >= {*self.ledger.views}:
                 raise InputError("frames", "no frame with evidence would be left", remedy="Delete the field instead.")
-            field, ledger = forget_views(self.field, self.ledger, names)
+            field = forget_warnings(self.field, sorted(names))
+            field, ledger = forget_views(field, self.ledger, names)
             return self._with(field, lambda: ledger)
 
     def _with(self, field: LanguageField, ledger: Callable[[], Ledger] | None) -> "Scene":

@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jsecon
 from jsecon.errors import InputError
@@ -48,6 +48,13 @@ def provenance(options: Options, keys: dict[str, str], out: Path, warnings: Sequ
     return json.dumps(origin, sort_keys=True)
 
 
+def forget_warnings(field: LanguageField, names: Sequence[str]) -> LanguageField:
+    """Leaves out what the run warned of some frames."""
+    warnings = parse_json(field.provenance).get("warnings", [])
+    kept = [text for text in warnings if not any(name in text for name in names)]
+    return _with_origin(field, getattr(field.provenance, "folder", None), warnings=kept)
+
+
 def move_hints(field: LanguageField, folder: Path) -> LanguageField:
     """Makes the hints of a field, which are relative to its file, those of a file in another folder."""
     before, folder = getattr(field.provenance, "folder", None), folder.resolve()
@@ -55,8 +62,13 @@ def move_hints(field: LanguageField, folder: Path) -> LanguageField:
         return field
     found = {kind: _resolve(before, hint) for kind, hint in parse_json(field.provenance).get("folders", {}).items()}
     hints = {kind: hint for kind, path in found.items() if path is not None and (hint := _hint(path, folder))}
-    origin = Provenance(json.dumps(parse_json(field.provenance) | {"folders": hints}, sort_keys=True))
-    origin.folder = folder
+    return _with_origin(field, folder, folders=hints)
+
+
+def _with_origin(field: LanguageField, folder: Path | None, **changes: Any) -> LanguageField:
+    origin = Provenance(json.dumps(parse_json(field.provenance) | changes, sort_keys=True))
+    if folder is not None:
+        origin.folder = folder
     return dataclasses.replace(field, provenance=origin)
 
 

@@ -26,7 +26,14 @@ from jsecon.types import UpAxis
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_OF_LENS = {"camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
+_OF_LENS |= {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "latlong", "equirectangular"}
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+_KNOWN = {*_OF_LENS, *_SPLITS, "frames", "up", "orientation_override", "val_frames", "test_frames"}
+_KNOWN |= {"applied_transform", "applied_scale"}
+_KNOWN |= {"depth_unit_scale_factor", "ply_file_path", "file_path", "transform_matrix", "depth_file_path", "mask_path"}
+_KNOWN |= {"aabb_scale", "scale", "offset", "colmap_im_id", "camera_id", "sharpness", "timestamp"}
+"""keys that are used, or that change no number"""
 _REMEDY = "Write the file anew (ns-process-data, colmap2nerf.py)."
 
 
@@ -47,7 +54,7 @@ def _read_nerfstudio(path: Path) -> PosedImages:
             content["test_frames"] = read_json(tested, "a transforms.json", _REMEDY)["frames"]
         scale = _number(content, "applied_scale", 1.0)
         unit = _number(content, "depth_unit_scale_factor", 0.001) * scale  # millimetres are nerfstudio's default
-        entries, notes = _split_frames(content)
+        entries, notes = _split_frames(file, content)
         for index, (entry, held_out) in enumerate(entries):
             name = entry["file_path"]
             with reading(file, remedy=_REMEDY, problem=f"frame {index} ({name}) cannot be read"):
@@ -79,7 +86,7 @@ def _read_inria(file: Path, cameras: list[Any]) -> PosedImages:
     return PosedImages(images, file)
 
 
-def _split_frames(content: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], bool | None]], list[str]]:
+def _split_frames(file: Path, content: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], bool | None]], list[str]]:
     """The frames of a file, each with whether its own split holds it out (None without a split), and notes.
 
     As nerfstudio does, frames that no list names are left out if the training frames and others are listed.
@@ -100,6 +107,10 @@ def _split_frames(content: dict[str, Any]) -> tuple[list[tuple[dict[str, Any], b
     notes = []
     if left_out:
         notes.append(f"{len(left_out)} frames in no list of the split were left out (the first: {left_out[0]}).")
+    records = [content, *(entry for entry, _ in entries)]
+    keys = {key for record in records for key, value in record.items() if value not in (None, False, "", [])}
+    if unused := sorted(keys - _KNOWN):
+        notes.append(f"Keys of {file.name} that are not used: {', '.join(unused)}.")
     return entries, notes
 
 
