@@ -18,7 +18,7 @@ from jsecon import InputError, LanguageField, Regions, Scene, load_field
 from jsecon.app.scene import open_scene
 from jsecon.app.server import application
 from jsecon.change import detect
-from jsecon.change.detect import _depth_cost, object_changes
+from jsecon.change.detect import depth_cost, object_changes
 from jsecon.change.history import events
 from jsecon.field.evidence import pack_evidence, view_evidence
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row
@@ -85,12 +85,12 @@ def test_depth_alone_tells_what_is_gone(eyes):
 def test_depth_shows_low_things_and_no_edge_that_lies_a_pixel_off():
     table, edge = np.full((12, 12), 1.4), np.full((12, 12), 1.4)
     edge[:, 6:] = 1.0
-    np.testing.assert_array_equal(_depth_cost(np.roll(edge, 1, axis=0), np.roll(edge, 1, axis=1)), 0)
+    np.testing.assert_array_equal(depth_cost(np.roll(edge, 1, axis=0), np.roll(edge, 1, axis=1)), 0)
     low = table.copy()
     low[4:8, 4:8] = 1.37
-    np.testing.assert_allclose(_depth_cost(low, table)[4:8, 4:8], -(1.5 * 0.03 / (0.03 * 1.4) - 0.5))
-    assert not _depth_cost(low, table)[:4].any()
-    assert np.isnan(_depth_cost(np.zeros((12, 12)), table)).all()
+    np.testing.assert_allclose(depth_cost(low, table)[4:8, 4:8], -(1.5 * 0.03 / (0.03 * 1.4) - 0.5))
+    assert not depth_cost(low, table)[:4].any()
+    assert np.isnan(depth_cost(np.zeros((12, 12)), table)).all()
 
 
 def field_with_ledger(gaussians, labels, eyes, frames):

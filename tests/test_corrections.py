@@ -14,7 +14,7 @@ from jsecon import render
 from jsecon.fit.corrections import CorrectionRates, Corrections, se3_exp
 from jsecon.fit.optimise import Schedule, fit_gaussians
 from jsecon.fit.quality import measure_quality
-from jsecon.fit.step import LearningRates, _apply_exposure, _corrected_camera, _TrainingViews, _view_loss
+from jsecon.fit.step import LearningRates, _TrainingViews, _view_loss, apply_exposure, corrected_camera
 from jsecon.poses import refine
 from jsecon.poses.refine import refine_capture
 
@@ -85,9 +85,9 @@ def test_exponential_is_smooth_everywhere_and_at_rest_nothing_changes(capture, x
         by = np.stack([(hat_exp(twist + h) - hat_exp(twist - h)) / 2e-6 for h in 1e-6 * np.eye(6)], axis=-1)
         np.testing.assert_allclose(slope(twist), by, atol=1e-8)
         np.testing.assert_allclose(back(twist), by, atol=1e-8)
-    assert same(_corrected_camera(capture.cameras[0], jnp.zeros(6, jnp.float32)), capture.cameras[0])
+    assert same(corrected_camera(capture.cameras[0], jnp.zeros(6, jnp.float32)), capture.cameras[0])
     image = jnp.asarray(capture.frames[0], jnp.float32)
-    np.testing.assert_array_equal(_apply_exposure(image, jnp.eye(3, 4, dtype=jnp.float32)), image)
+    np.testing.assert_array_equal(apply_exposure(image, jnp.eye(3, 4, dtype=jnp.float32)), image)
 
 
 def test_gradients_through_the_whole_step_are_central_differences(capture, truth, x64):

@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 from small_field import REGIONS, labels_of, true_regions, unit_rows, votes_of
 
 from jsecon import distill_l1, distill_votes, plan_capacity, plan_view, render
-from jsecon.paper.distill import _rendered_l1
+from jsecon.paper.distill import rendered_l1
 
 KEY = jax.random.key(0)
 
@@ -143,7 +143,7 @@ def test_the_gradient_of_the_rendered_l1_is_that_of_finite_differences(task, sca
         start = scale * jnp.asarray(unit_rows(np.random.default_rng(3), scene.count, 3), jnp.float64)
 
         def loss(features):
-            return _rendered_l1(features, plan, jnp.asarray(labels[1]), codes)[0]
+            return rendered_l1(features, plan, jnp.asarray(labels[1]), codes)[0]
 
         check_grads(jax.jit(loss), (start,), order=1, modes=["rev"], eps=1e-7 * scale, rtol=1e-4)
 

@@ -191,6 +191,9 @@ ALONE = [-1] * REGIONS
 
 
 @pytest.mark.parametrize(("tree", "leaf", "problem"), [
+    (ALONE[1:], -1, "a tree whose nodes"), ([1, *ALONE[1:]], -1, "a tree whose nodes"),
+    ([REGIONS, *ALONE[1:]], -1, "a tree whose nodes"), ([-1.0] * REGIONS, -1, "a tree whose nodes"),
+    ([REGIONS, *ALONE[1:], 0], -1, "a tree whose nodes"),
     (ALONE, None, "a tree without the smallest nodes"), (ALONE, REGIONS, "beyond"),
 ])  # fmt: skip
 def test_a_tree_that_is_not_of_its_gaussians_is_refused(field, tmp_path, tree, leaf, problem):

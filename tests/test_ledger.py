@@ -18,7 +18,7 @@ from jsecon.errors import InputError
 from jsecon.field.evidence import _unpack_evidence, pack_evidence, region_votes, view_evidence
 from jsecon.field.field import load_field
 from jsecon.field.ledger import Ledger, LedgerView, add_views, camera_row, forget_views
-from jsecon.field.ledger_file import _ledger_file, load_ledger, save_with_ledger
+from jsecon.field.ledger_file import ledger_file, load_ledger, save_with_ledger
 from jsecon.field.membership import normalise_votes
 from jsecon.field.regions import region_embeddings
 from jsecon.types import Regions
@@ -162,7 +162,7 @@ def test_a_field_without_its_ledger_is_refused_in_one_sentence(scene, cameras, l
     with refused(path, "no ledger", "--no-ledger"):
         load_ledger(path, load_field(path))
     field = save_with_ledger(path, field, Ledger(REGIONS, views))
-    file = _ledger_file(path, field)
+    file = ledger_file(path, field)
     data = file.read_bytes()
     file.write_bytes(data[:-40])
     with refused(file, "damaged"):

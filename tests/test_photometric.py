@@ -10,8 +10,8 @@ from conftest import cameras_of, capture_of
 from jax.test_util import check_grads
 
 from jsecon.fit.photometric import photometric_loss, psnr
-from jsecon.fit.quality import _ssim_map, measure_quality
-from jsecon.pipeline.scene import _is_weak
+from jsecon.fit.quality import measure_quality, ssim_map
+from jsecon.pipeline.scene import is_weak
 from jsecon.splat.points import gaussians_from_points
 
 
@@ -46,7 +46,7 @@ def ssim_twin(x, y):
 def test_ssim_and_loss_equal_their_definitions_one_image_at_a_time_and_together():
     image, target = images()
     expected = ssim_twin(image, target)
-    np.testing.assert_allclose(_ssim_map(image, target), expected, atol=2e-4)
+    np.testing.assert_allclose(ssim_map(image, target), expected, atol=2e-4)
     absolute = np.abs(image.astype(np.float64) - target).mean()
     mixture = 0.8 * absolute + 0.2 * (1 - expected.mean())
     assert float(photometric_loss(image, target)) == pytest.approx(mixture, abs=1e-5)
@@ -57,7 +57,7 @@ def test_ssim_and_loss_equal_their_definitions_one_image_at_a_time_and_together(
         photometric_loss(image, target[:, 1:])
     with jax.enable_x64(True):
         image, target = images(dtype=np.float64)
-        np.testing.assert_allclose(_ssim_map(image, target), ssim_twin(image, target), atol=1e-12)
+        np.testing.assert_allclose(ssim_map(image, target), ssim_twin(image, target), atol=1e-12)
         image, target = (jnp.asarray(a) for a in images((7, 6, 2), dtype=np.float64))
         loss = jax.jit(lambda image: photometric_loss(image, target))
         check_grads(loss, (image,), order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
@@ -92,7 +92,7 @@ TYPICAL = 25 + np.random.default_rng(0).normal(0, 0.5, 40)
     ([25.0, 25.5, 24.5, 25.2, 12.0, np.nan], [4]), ([25.0, 25.5, 24.5, 25.2, 12.0, np.inf], [4]), ([np.nan] * 2, []),
 ])  # fmt: skip
 def test_weak_frames_are_far_below_the_others(figures, weak):
-    np.testing.assert_array_equal(np.flatnonzero(_is_weak(np.asarray(figures, np.float64))), weak)
+    np.testing.assert_array_equal(np.flatnonzero(is_weak(np.asarray(figures, np.float64))), weak)
 
 
 BEHIND = gaussians_from_points(np.array([[0, 0, -5.0]], np.float32), np.zeros((1, 3), np.uint8))

@@ -11,7 +11,7 @@ import pytest
 from browser import CHROMIUM, driven
 
 from jsecon.app import report
-from jsecon.app.exports import _crop
+from jsecon.app.exports import crop
 
 
 class _Reader(HTMLParser):
@@ -85,10 +85,10 @@ def test_in_a_browser_pictures_are_enlarged_and_cards_open(page, tmp_path):
 
 
 def test_a_picture_is_cut_to_a_mask():
-    np.testing.assert_array_equal(_crop(_image(), np.zeros((24, 32), bool)), _image())
+    np.testing.assert_array_equal(crop(_image(), np.zeros((24, 32), bool)), _image())
     mask = np.zeros((240, 320), bool)
     mask[100:150, 200:220] = True
     rows, columns = np.mgrid[:240, :320]
-    part = _crop(np.stack([rows, columns, mask], axis=-1).astype(np.uint8), mask)
+    part = crop(np.stack([rows, columns, mask], axis=-1).astype(np.uint8), mask)
     assert part[..., 2].sum() == mask.sum()
     assert part[..., 2].mean() > 0.15

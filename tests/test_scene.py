@@ -62,6 +62,8 @@ def test_a_node_of_the_tree_selects_the_gaussians_under_it():
     (At("nowhere", 1, 1), {}, "no such frame"), (At(0, 99, 200), {}, "outside the frame"),
     (At(0, 0, 0), {}, "no region lies under"), (Box(0, 500, 3, 600, 9), {}, "pixels of a frame of 100x80"),
     (Mask({0: np.zeros((80, 100), bool)}), {}, "no pixel inside"),
+    (Mask({0: np.ones((80, 100), bool), "frame_0": np.ones((80, 100), bool)}), {}, "two masks"),
+    (Box(0, 1, 1, 5, 5), {"by": "code"}, "by the outline alone"),
     ("red mug", {"by": "code"}, "has no codes"), (" ", {}, "without words"), ("a text of nothing", {}, "colour"),
 ])  # fmt: skip
 def test_what_cannot_be_answered_ends_in_a_sentence(table, question, options, problem):

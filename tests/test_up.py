@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from table_field import table_field
 
 from jsecon import At, load_field, save_field
-from jsecon.app.scene import Scene, _pixel_of
+from jsecon.app.scene import Scene, pixel_of
 from jsecon.errors import InputError
 from jsecon.types import Camera, UpAxis
 from jsecon.views.frame import _up_of_cameras, find_up_axis
@@ -125,6 +125,6 @@ def test_a_field_keeps_up_and_metres_and_an_older_one_has_neither(tmp_path):
 )
 def test_a_pixel_can_be_shares_of_the_frame(share, pixel):
     scene = Scene(*table_field())
-    assert _pixel_of(At(0, *share), 100, 80) == pixel
+    assert pixel_of(At(0, *share), 100, 80) == pixel
     with pytest.raises(InputError, match="of 100x80 px"):
         scene.ask(At(0, 0.001, 0.002))

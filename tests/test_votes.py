@@ -16,7 +16,7 @@ from jsecon.field.evidence import IGNORED, region_votes, sum_evidence, view_evid
 from jsecon.field.membership import normalise_votes
 from jsecon.splat import visible
 from jsecon.splat.render import render_rgb
-from jsecon.splat.visible import _padded_size, render_in_blocks, visible_part
+from jsecon.splat.visible import padded_size, render_in_blocks, visible_part
 from jsecon.types import Regions, Votes
 
 REGIONS = 11
@@ -247,7 +247,7 @@ def test_a_view_is_rendered_from_what_it_can_see(monkeypatch):
     empty = dataclasses.replace(scene, means=away)
     np.testing.assert_array_equal(render_in_blocks(empty, cameras[0]), 0)
     counts = range(0, 300_000, 4_999)
-    sizes = [_padded_size(count) for count in counts]
+    sizes = [padded_size(count) for count in counts]
     assert sizes == sorted(sizes)
     assert len(set(sizes)) < 40
     assert all(count <= size <= max(1.13 * count, count + 4096) for count, size in zip(counts, sizes))

@@ -89,7 +89,7 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
         if verb.out is not None:
             scene.export(verb.out, mask, labels=listed, points=points)
             written["scene"] = verb.out
-            console.print_line(f"{count} Gaussians  {verb.out}")
+            console.print_line(f"{'points of ' * points}{count} Gaussians  {verb.out}")
         if verb.objects is not None and listed is not None:
             written["objects"] = _save_objects(scene, listed, verb.objects)
             console.print_line(f"{len(written['objects'])} objects  {verb.objects}")
@@ -106,12 +106,15 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
 
 def _list_objects(scene: Scene, is_needed: bool, console: Console) -> Catalogue | None:
     """Lists the objects; None with a note where an export can do without and they cannot be had."""
-    if is_needed:
-        return scene.objects()
-    with contextlib.suppress(InputError):
-        if not is_mapped(scene.field):
+    reason: Any = "the field is larger than memory"
+    if is_needed or not is_mapped(scene.field):
+        try:
             return scene.objects()
-    console.note("no labels.json is written: the field is larger than memory, or its model is not on this machine")
+        except InputError as error:  # such as no model for the names
+            if is_needed:
+                raise
+            reason = error
+    console.note(f"no labels.json is written: {reason}")
     return None
 
 
@@ -159,7 +162,7 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
             figures = [report.figure(scene.render(name, mask), name) for name in record["frames"]]
             best = next(iter(record["frames"]), 0)
             outline = scene.mask(mask, best)
-            picture = _crop(pictures.selection_overlay(scene.render(best), outline, tint=0.0), outline)
+            picture = crop(pictures.selection_overlay(scene.render(best), outline, tint=0.0), outline)
             words = f"{record['id']}: {_words(record)}"
             card = report.card(picture, record["name"], words, report.grid(figures, 3))
             cards[_is_unsure(records, record) or record["surroundings"]].append(card)
@@ -170,7 +173,7 @@ def _page(scene: Scene, catalogue: Catalogue, records: list[dict[str, Any]], con
     return report.page("Objects", lead, [report.grid(cards[False]), *folded])
 
 
-def _crop(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+def crop(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Cuts out the square around a mask, with a margin; the whole image if the mask is empty."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):

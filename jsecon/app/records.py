@@ -86,7 +86,7 @@ class Query:
         shows most objects where the cameras look in all directions.
 
     Raises:
-      InputError: A number is out of its range.
+      InputError: A number is out of its range, or a box or mask is to be answered by codes.
       ValueError: `by` is unknown.
     """
 
@@ -105,6 +105,9 @@ class Query:
             if value is not None and not least <= value <= 1:
                 expected = f"a number from {least} to 1"
                 raise InputError(name, f"{value:g}", expected, f"Leave {name} out for the default.")
+        if isinstance(self.question, Box | Mask) and self.by != "votes":
+            problem = "a mask or a box selects by the outline alone"
+            raise InputError("by", problem, remedy="Leave it out, or ask a text.")
 
     def __str__(self) -> str:
         """The text, or the name of a pixel, box, mask or region."""

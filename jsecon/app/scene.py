@@ -388,7 +388,7 @@ class Scene:
         index = frame_index(self.field, question.frame)
         name = self.field.names[index]
         cameras = self.field.cameras
-        x, y = _pixel_of(question, cameras.width, cameras.height)
+        x, y = pixel_of(question, cameras.width, cameras.height)
         region = region_at(self.field, index, x, y)
         if region < 0:
             problem = f"no region lies under column {x}, row {y} of {cameras.width}x{cameras.height} px"
@@ -468,6 +468,8 @@ class Scene:
         self._require_memory("an outline")
         frames = question.frames if isinstance(question, Mask) else {question.frame: self._box_mask(question)}
         given = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
+        if len(given) < len(frames):
+            raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
         masks = np.stack([np.asarray(mask, int) for mask in given.values()])
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
         selection = lift(self.field, masks, list(given), threshold=threshold)
@@ -828,7 +830,7 @@ def _run_warnings(field: LanguageField) -> list[str]:
         return []
 
 
-def _pixel_of(point: At, width: int, height: int) -> tuple[int, int]:
+def pixel_of(point: At, width: int, height: int) -> tuple[int, int]:
     """Column and row of a point in frames of a size, px."""
     is_share = 0 <= point.x <= 1 and 0 <= point.y <= 1 and any(number % 1 for number in (point.x, point.y))
     if not is_share:

@@ -114,7 +114,7 @@ class _View(NamedTuple):
         """The cost of a rendering inside a window."""
         cost = _colour_cost(self.photo[window], rgb)
         if self.depth is not None:
-            apart = _depth_cost(self.depth[window], z)
+            apart = depth_cost(self.depth[window], z)
             cost = np.where(np.isnan(apart), cost, np.maximum(0.6 * cost, np.abs(apart)))
         return np.where(alpha >= _KNOWN, cost, np.nan)
 
@@ -243,7 +243,7 @@ def _colour_cost(
     return np.minimum(np.sqrt(best) / _COLOUR_STEP, 1.0)
 
 
-def _depth_cost(depth: Float[np.ndarray, "h w"], rendered: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def depth_cost(depth: Float[np.ndarray, "h w"], rendered: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """How little rendered depth explains a measured one, -1 to 1: negative where the measured surface is nearer.
 
     It is that of least size over shifts of up to one px; NaN where either is unknown (0).
@@ -393,7 +393,7 @@ class _Search:
         for view, owners in zip(self.first, self.owners):
             known = (owners >= 0) & ~np.isnan(view.cost)
             if view.depth is not None:
-                known &= ~(_depth_cost(view.depth, view.z) < -0.5)
+                known &= ~(depth_cost(view.depth, view.z) < -0.5)
             columns.append([np.bincount(owners[mask], minlength=count) for mask in (known, known & (view.cost > 0.5))])
         known, differing = np.array(columns).transpose(1, 2, 0)
         return known, differing
@@ -446,7 +446,7 @@ class _Search:
         number, image, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
         down = -(np.asarray(view.camera.world_to_camera, np.float64)[:3, :3] @ self.up)[:2]
         height, width = mask.shape
-        bare = np.zeros(mask.shape, bool) if view.depth is None else _depth_cost(view.depth, view.z) > 0.3
+        bare = np.zeros(mask.shape, bool) if view.depth is None else depth_cost(view.depth, view.z) > 0.3
         result = []
         for n in range(1, number):
             left, top, across, tall, area = stats[n]

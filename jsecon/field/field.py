@@ -206,7 +206,23 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
         return f"harmonics of {field.gaussians.sh.shape[1]} functions"
     if (field.tree is None) != (field.leaf is None):
         return "a tree without the smallest nodes of its Gaussians, or these without a tree"
+    if field.tree is not None and not _is_tree(np.asarray(field.tree), field.regions.count):
+        return "a tree whose nodes do not come before their parents, or form circles"
     scale = field.metres_per_unit
     if scale is not None and not (isinstance(scale, int | float) and 0 < scale < np.inf):
         return f"a unit of {scale!r} metres"
     return None
+
+
+def _is_tree(parent: np.ndarray, count: int) -> bool:
+    """Whether these are the parents of the nodes of a tree over `count` regions and their parts."""
+    own = np.arange(len(parent))
+    if parent.dtype.kind != "i" or len(parent) < count:
+        return False
+    above = (parent > own) & (parent >= count) & (parent < len(parent))
+    of_region = (own >= count) & (parent >= 0) & (parent < count)
+    if not (above | of_region | (parent == -1)).all():
+        return False
+    for _ in range(len(parent).bit_length()):  # no node is above itself
+        parent = np.where(parent >= 0, parent[parent], -1)
+    return bool((parent == -1).all())

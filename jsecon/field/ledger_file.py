@@ -30,7 +30,7 @@ from jsecon.types import LanguageField
 _REMEDY = "Make the field again with jsecon run, without --no-ledger; the finished stages are reused."
 
 
-def _ledger_file(path: Path, field: LanguageField) -> Path:
+def ledger_file(path: Path, field: LanguageField) -> Path:
     """Returns the path of the ledger of a field's file."""
     return path.with_suffix(".evidence") / f"{parse_json(field.provenance).get('ledger')}.safetensors"
 
@@ -47,15 +47,15 @@ def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) ->
             digest.update(np.ascontiguousarray(array).data)
         origin["ledger"] = digest.hexdigest()
     field = dataclasses.replace(field, provenance=json.dumps(origin, sort_keys=True))
-    is_new = ledger is not None and not _ledger_file(path, field).is_file()
+    is_new = ledger is not None and not ledger_file(path, field).is_file()
     if is_new:
-        with atomic_write(_ledger_file(path, field)) as temporary:
+        with atomic_write(ledger_file(path, field)) as temporary:
             write_arrays(temporary, arrays, {"format": "jsecon-ledger", "version": 2, "ledger": tree})
     try:
         save_field(path, field)
     except InputError:
         if is_new:  # a full disk needs its room
-            remove_files(_ledger_file(path, field).parent, [_ledger_file(path, field).name])
+            remove_files(ledger_file(path, field).parent, [ledger_file(path, field).name])
         raise
     remove_stale(path, field)
     return field
@@ -63,14 +63,14 @@ def save_with_ledger(path: Path, field: LanguageField, ledger: Ledger | None) ->
 
 def remove_stale(path: Path, field: LanguageField) -> None:
     """Removes ledgers of earlier states of a field, which a stopped program may have left, too."""
-    file = _ledger_file(path, field)
+    file = ledger_file(path, field)
     if file.parent.is_dir():
         remove_files(file.parent, {*os.listdir(file.parent)} - {file.name})
 
 
 def load_ledger(path: Path, field: LanguageField) -> Ledger:
     """Reads the ledger of a field's file."""
-    file = _ledger_file(path, field)
+    file = ledger_file(path, field)
     if "ledger" not in parse_json(field.provenance):
         raise InputError(path, "the field has no ledger of its views", remedy=_REMEDY)
     if not file.is_file():

@@ -25,11 +25,11 @@ def _compare(
     """PSNR over the counted pixels, and the mean SSIM over their windows, with the rendering in place of the others."""
     image = np.clip(image, 0, 1)
     target = np.where(counted[..., None], frame.astype(np.float32) / 255, image)
-    similarity = _ssim_map(image, target)[counted].mean(dtype=np.float64)
+    similarity = ssim_map(image, target)[counted].mean(dtype=np.float64)
     return float(psnr(image[counted], target[counted])), float(similarity)
 
 
-def _ssim_map(image: Float[np.ndarray, "h w c"], target: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+def ssim_map(image: Float[np.ndarray, "h w c"], target: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
     """Computes the structural similarity of each pixel and channel, in [-1, 1] (Wang 2004, eq. 13).
 
     OpenCV blurs: no program is compiled for a size.

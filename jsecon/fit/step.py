@@ -160,7 +160,7 @@ def _view_loss(
     Returns:
       The value to descend; and the loss without votes, and the number of pairs that overflowed.
     """
-    camera = view.camera if correction is None else _corrected_camera(view.camera, correction.twists)
+    camera = view.camera if correction is None else corrected_camera(view.camera, correction.twists)
     colours = map_rows(colours_from_sh, gaussians, camera, mesh)
     # The votes are the gradient of a fourth channel of zeros: they need no separate pass.
     features = jnp.concatenate([colours, vote_channel], axis=1)
@@ -168,7 +168,7 @@ def _view_loss(
     # Features that are not finite end the fit in any case.
     rendering = render_plan(plan, features, depth=view.depth is not None, finite=True)
     image, votes = rendering.features[..., :3], rendering.features[..., 3]
-    image = image if correction is None else _apply_exposure(image, correction.colours)
+    image = image if correction is None else apply_exposure(image, correction.colours)
     target = view.frame.astype(image.dtype) / 255.0
     if view.ignored is not None:  # both show the rendering there: exact, as SSIM's windows reach across the border
         ignored, rendered = view.ignored[..., None], jax.lax.stop_gradient(image)
@@ -187,7 +187,7 @@ def _view_loss(
     return value + jnp.sum(error * votes), (value, rendering.overflow)
 
 
-def _corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
+def corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
     """Moves a camera by a twist in its frame: exp(twist) world_to_camera."""
     motion, pose = se3_exp(twist), camera.world_to_camera
     # Multiply-and-sum: exact float32 on every backend.
@@ -195,7 +195,7 @@ def _corrected_camera(camera: Camera, twist: Float[Array, "6"]) -> Camera:
     return dataclasses.replace(camera, world_to_camera=moved)
 
 
-def _apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
+def apply_exposure(image: Float[Array, "h w 3"], colour: Float[Array, "3 4"]) -> Float[Array, "h w 3"]:
     """Applies the colour map of a view to rendered colours, without clamping."""
     r, g, b = image[..., 0], image[..., 1], image[..., 2]
     return jnp.stack([row[0] * r + row[1] * g + row[2] * b + row[3] for row in colour], axis=-1)

@@ -195,8 +195,9 @@ class ClipEmbedder:
 
         SigLIP's pooler is the last step and includes the projection; CLIP's lies before it.
         """
-        names = [name for name in graph.outputs if "embed" in name or (self._rules and name == "pooler_output")]
-        name = names[0] if names else "embedding"
+        known = "embedding", f"{kind}_embeds", f"{kind}_features", f"{kind}_embedding"
+        names = known if self._rules is None else (*known, "pooler_output")
+        name = next((name for name in names if name in graph.outputs), "embedding")
         return graph.require("output", name, (None, None), f"CLIP's graph of {kind}s with its projection")
 
     def _run_visual(self, crops: UInt8[np.ndarray, "b s s 3"]) -> np.ndarray:

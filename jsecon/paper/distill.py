@@ -168,7 +168,7 @@ def distill_l1(
     return _Distillation(codes, losses)
 
 
-def _rendered_l1(
+def rendered_l1(
     features: Float[Array, "n d"], plan: ViewPlan, labels: Integer[Array, "h w"], region_codes: Float[Array, "r d"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Computes the paper's loss of one view, the mean over all H W d numbers of |F m - G m|, and the overflow.
@@ -203,7 +203,7 @@ def _descend(features, gaussians, cameras, labels, region_codes, plans, order, c
             plan = plan_view(gaussians, cameras[view], capacity=capacity)
         else:
             plan = jax.tree.map(lambda a: a[view], plans)
-        return _rendered_l1(features, plan, labels[view], codes)
+        return rendered_l1(features, plan, labels[view], codes)
 
     def step(state, view):
         features, moments = state

@@ -316,7 +316,7 @@ def _measure_held_out(stage: StageInput) -> StageResult:
     train = np.flatnonzero(~np.asarray(capture.held_out))
     measure = partial(measure_quality, scene, capture, background=background, progress=stage.progress)
     fitted = measure(frames=train, long_side=QUICK_LONG_SIDE)
-    weak = np.flatnonzero(_is_weak(np.asarray(fitted.psnr)))
+    weak = np.flatnonzero(is_weak(np.asarray(fitted.psnr)))
     notes = ()
     if len(weak):
         names = join_first([f"{capture.names[fitted.frames[n]]} ({fitted.psnr[n]:.1f} dB)" for n in weak])
@@ -325,7 +325,7 @@ def _measure_held_out(stage: StageInput) -> StageResult:
     return StageResult(measure(), notes=notes)
 
 
-def _is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+def is_weak(psnr: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """Finds frames far below the median PSNR (dB): wrong poses, moving things, a finger before the lens."""
     values = np.asarray(psnr, np.float64)
     known = values[np.isfinite(values)]

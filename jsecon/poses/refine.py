@@ -21,11 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from jsecon.fit.corrections import (
-    CorrectionRates,
-    Corrections,
-    se3_exp,
-)
+from jsecon.fit.corrections import CorrectionRates, Corrections, se3_exp
 from jsecon.fit.optimise import FitState, Schedule, fit_gaussians
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import LearningRates, cameras_extent
@@ -121,7 +117,7 @@ def refine_capture(
     aligned = None if capture.depths is None else _align_by_depth(capture, train, held_out)
     if aligned is None and max_fit_steps is not None:
         return _with_notes(
-            capture, "poses and exposures stay as they are: by colour and depth the frames agree on them"
+            capture, "poses and exposures stay as they are: depth does not bring the frames clearly nearer together"
         )
     by_depth, refine = aligned is not None, CorrectionRates()
     if aligned is not None:

@@ -36,7 +36,7 @@ def visible_part(
 ) -> tuple[Int[np.ndarray, " m"], Gaussians]:
     """Finds the ids (ascending) of the Gaussians that a view can see, and reads their geometry, in black.
 
-    Transparent Gaussians follow, up to `_padded_size(M)`, or `least`.
+    Transparent Gaussians follow, up to `padded_size(M)`, or `least`.
     """
     check_gaussians(gaussians, camera)
     geometry = dataclasses.replace(gaussians, sh=np.zeros((gaussians.count, 0, 3), np.float32))
@@ -45,7 +45,7 @@ def visible_part(
         block = jax.tree.map(lambda a, first=first: np.asarray(a[first : first + ROWS], np.float32), geometry)
         blocks.append(first + np.flatnonzero(np.asarray(_is_visible(block, camera, near))))
     ids = np.concatenate(blocks)
-    size = max(_padded_size(len(ids)), least)
+    size = max(padded_size(len(ids)), least)
 
     def fill(a):
         return np.zeros((size - len(ids), *a.shape[1:]), np.float32)
@@ -71,7 +71,7 @@ def _is_visible(gaussians: Gaussians, camera: Camera, near: float) -> Array:
     return project(gaussians, camera, near=near).visible
 
 
-def _padded_size(count: int) -> int:
+def padded_size(count: int) -> int:
     """Rounds a count up to an eighth of a power of two, at least 4,096, so that views share compiled programs."""
     step = max(4096, 1 << max(count.bit_length() - 4, 0))
     return max(-(-count // step), 1) * step
