@@ -786,7 +786,7 @@ class Scene:
             if cloud is None:
                 problem, remedy = "the field has no file of points that is still there", "Make it of one, or keep that."
                 raise InputError(f"scene {self.name}", problem, remedy=remedy)
-            placed = transform_gaussians(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), world)
+            placed = transform_gaussians(dataclasses.replace(gaussians, sh=None), world)
             near = nearest_gaussians(load_point_cloud(cloud).points, placed)
             rows = np.arange(len(near)) if mask is None else np.flatnonzero(np.append(mask, False)[near])
             ids = {name: np.append(column, np.int32(-1))[near[rows]] for name, column in ids.items()}
