@@ -28,7 +28,7 @@ from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import match_parts
 from jsecon.query.pointing import frame_index
-from jsecon.query.referring import evaluate, with_everything
+from jsecon.query.referring import find_referents, with_everything
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
 from jsecon.read.captures.frames import transform_poses
@@ -211,7 +211,7 @@ class ObjectIndex:
         units = 1.0, 1.0 / (metres or 1.0)
         view, words = self._view(query.frame)
         readings = expression.readings()
-        outcomes = [evaluate(self._objects_of, expression.thing, reading, view, units) for reading in readings]
+        outcomes = [find_referents(self._objects_of, expression.thing, reading, view, units) for reading in readings]
         place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
         best, others = outcomes[place], outcomes[place + 1 :]
         chosen = {found.regions for found in best.chosen}

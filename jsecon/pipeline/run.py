@@ -208,7 +208,7 @@ def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console:
         return result
 
     with console.progress(stage.name) as progress:
-        result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=console.note)
+        result, seconds, fresh = cache.read_or_compute(path, functools.partial(compute, progress), note=console.note)
     setattr(state.results, stage.name, result.value)
     state.seconds[stage.name] = seconds
     checkpoint.remove()

@@ -49,7 +49,7 @@ class _Solid(NamedTuple):
     """Middle of the primitive."""
 
 
-def surface_points(
+def object_surfaces(
     gaussians: Gaussians, cameras: Camera, labels: Int[np.ndarray, " n"]
 ) -> list[Float[np.ndarray, "s 3"]]:
     """Finds what T views show of the surfaces of objects, labelled 0 .. K-1 or -1: a point of each pixel, world.
