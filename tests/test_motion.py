@@ -250,9 +250,9 @@ def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_p
     for name in "abc":
         cv2.imwrite(str(tmp_path / f"{name}.jpg"), np.zeros((6, 8, 3), np.uint8))
     stage = plan_capture(context_of(tmp_path, tmp_path / "f"))[0]
-    assert "3 photographs" in stage.how
-    assert (others[0].partition("/")[0] in stage.how) == bool(says)
-    assert says in stage.how
+    assert "3 photographs" in stage.task
+    assert (others[0].partition("/")[0] in stage.task) == bool(says)
+    assert says in stage.task
 
 
 @pytest.mark.parametrize(("names", "head", "says"), [

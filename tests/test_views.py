@@ -282,7 +282,7 @@ def posed(around):
 def views_of(splat, **options):
     """The capture of renders that a run makes of a splat, its notes, and what the run plans."""
     result, stage = compute_stage(context_of(splat, splat.parent / "out", long_side=160, **options), "load")
-    return result.value, " ".join(result.notes), stage.how
+    return result.value, " ".join(result.notes), stage.task
 
 
 @pytest.mark.parametrize("kind", ["cameras.json", "transforms.json", "applied", "sparse"])

@@ -467,12 +467,12 @@ class Scene:
         """Selects the object that a box or masks outline in frames."""
         self._require_memory("an outline")
         frames = question.frames if isinstance(question, Mask) else {question.frame: self._box_mask(question)}
-        given = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
-        if len(given) < len(frames):
+        masks_by_frame = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
+        if len(masks_by_frame) < len(frames):
             raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-        masks = np.stack([np.asarray(mask, int) for mask in given.values()])
+        masks = np.stack([np.asarray(mask, int) for mask in masks_by_frame.values()])
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
-        selection = lift(self.field, masks, list(given), threshold=threshold)
+        selection = lift(self.field, masks, list(masks_by_frame), threshold=threshold)
         mask, _ = trim(self.field, selection, "supported" if query.outliers else None)
         return self._finish(query, (selection, mask, 1))
 
@@ -676,7 +676,7 @@ class Scene:
         mask = np.zeros(self.field.gaussians.count, bool)
         for event, _ in found:
             mask[np.asarray(event.rows)] = True
-        words = [f"{told['name'] or 'something'} {told['kind']} {told['date']}" for _, told in found]
+        words = [f"{record['name'] or 'something'} {record['kind']} {record['date']}" for _, record in found]
         reason = "; ".join(words) or "the history of the field has no such change (jsecon update)"
         region, score = np.asarray(-1, np.int32), np.asarray(float(len(found) > 0), np.float32)
         selection = Selection(mask, mask.astype(np.float32), region, score)

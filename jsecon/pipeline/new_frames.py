@@ -182,8 +182,8 @@ def make_views(
         count = old + new
         evidence = list_labels(labels, count)
         if new:  # the next frame may show them too
-            own = evidence.matrix(len(owner), count)
-            opened.append(own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9)).tocsr())
+            view_weights = evidence.matrix(len(owner), count)
+            opened.append(view_weights[:, old:count].multiply(1 / np.maximum(view_weights.sum(1), 1e-9)).tocsr())
         shown, areas = np.unique(labels[labels >= 0], return_counts=True)
         rows = np.asarray(embedder.embed_regions(pixels, labels[None] == shown[:, None, None]), np.float32)
         pixel_counts = np.stack([shown, areas]).astype(np.int32)

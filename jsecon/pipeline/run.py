@@ -118,7 +118,7 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
     for stage in stage_list:
         keys[stage.name] = stage.key(keys, context.out)
     paths = {name: context.out / "cache" / f"{name}-{key}.safetensors" for name, key in keys.items()}
-    steps = [Step(stage.name, "cached" if paths[stage.name].exists() else "run", stage.how) for stage in stage_list]
+    steps = [Step(stage.name, "cached" if paths[stage.name].exists() else "run", stage.task) for stage in stage_list]
     return _RunState(keys, paths, steps)
 
 

@@ -80,8 +80,8 @@ def _given_points(options: Options) -> Path | None:
 
 def _relative_folders(options: Options, out: Path) -> dict[str, str]:
     """Folders of options, relative to the output folder."""
-    given = {"embedder": options.embedder, "points": _given_points(options)}
-    paths = {name: Path(path) for name, path in given.items() if path is not None}
+    inputs = {"embedder": options.embedder, "points": _given_points(options)}
+    paths = {name: Path(path) for name, path in inputs.items() if path is not None}
     return {name: hint for name, path in paths.items() if cached_address(path) is None and (hint := _hint(path, out))}
 
 

@@ -133,7 +133,7 @@ def with_everything(relation: str, chosen: Sequence[Object], things: Sequence[Ob
 
 def _apart(a: Sequence[Object], b: Sequence[Object]) -> Bool[np.ndarray, "k l"]:
     """Which pairs of objects have no region in common."""
-    return np.array([[not set(one.regions) & set(other.regions) for other in b] for one in a])
+    return np.array([[not set(first.regions) & set(other.regions) for other in b] for first in a])
 
 
 def _condition_scores(
