@@ -15,7 +15,7 @@ from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.pipeline.run import _compute_stages
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
@@ -171,7 +171,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them_with_its_output_among_the_ph
     def again(**changes):
         context = context_of(folder, out, holdout=4, **changes)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jsecon.pipeline.scene.find_poses", copied)
+            patch.setattr("jsecon.pipeline.scene_stages.find_poses", copied)
             done = _compute_stages(context, plan_capture(context))
         return {step.name: step.status for step in done.steps}, " ".join(done.notes)
 

@@ -12,7 +12,7 @@ from conftest import cameras_of
 from photo_files import apart
 from scipy.spatial.transform import Rotation
 
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, unposed_photographs
 from jsecon.read.captures.images import write_image

@@ -9,7 +9,7 @@ from test_corrections import capture as capture, truth as truth  # fixtures
 from test_fit import same
 
 from jsecon.pipeline.run import _compute_stages
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 
 
 def load(folder, out, **options):

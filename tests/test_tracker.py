@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from balls import HEIGHT, WIDTH, ious, ring_of_balls
 
-from jsecon.association import scene as association
-from jsecon.association.scene import superpixels
+from jsecon.association import frame_superpixels as association
+from jsecon.association.frame_superpixels import superpixels
 from jsecon.paper.tracker import GeometricTracker
 
 

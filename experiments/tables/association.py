@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.rivals.evidence import Evidence, unit
 from jsecon.association.consensus import track_masks
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 
 ROWS = 64
 """The number of regions is padded to a multiple of this, so that scenes share compiled programs."""

@@ -18,7 +18,7 @@ from jsecon.fit.optimise import Schedule, fit_gaussians
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import LearningRates
 from jsecon.read.masks.masks import load_labels
-from jsecon.read.splats.files import load_gaussians
+from jsecon.read.splats.formats import load_gaussians
 from jsecon.read.splats.writing import save_gaussians
 from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Gaussians

@@ -23,7 +23,7 @@ from jsecon.splat.points import back_project, gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, LanguageField
-from jsecon.views.capture import render_capture
+from jsecon.views.rendered import render_capture
 from jsecon.vision.protocols import Embedder
 
 LONG_SIDE = 320

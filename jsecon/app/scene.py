@@ -47,10 +47,10 @@ from jsecon.query.expressions import is_expression, parse_query, split_part
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.parts import match_parts
 from jsecon.query.pointing import OUTSIDE, UNKNOWN, frame_index, lift, region_at
-from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
+from jsecon.query.selection_masks import selection_mask
 from jsecon.read.captures.frames import move_capture, take_frames
-from jsecon.read.splats.points import load_point_cloud, save_point_cloud
+from jsecon.read.splats.point_clouds import load_point_cloud, save_point_cloud
 from jsecon.read.splats.writing import save_gaussians
 from jsecon.splat.points import nearest_gaussians
 from jsecon.splat.transform import transform_gaussians

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, Int32, Integer, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, Sparse, assign_superpixels, one_hot
+from jsecon.association.frame_superpixels import FrameSuperpixels, SceneSuperpixels, Sparse, assign_superpixels, one_hot
 from jsecon.errors import require
 from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential

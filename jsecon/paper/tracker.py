@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 
-from jsecon.association.scene import (
+from jsecon.association.frame_superpixels import (
     FrameSuperpixels,
     SceneSuperpixels,
     assign_superpixels,

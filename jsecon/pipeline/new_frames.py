@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, frame_superpixels, label_by_regions
+from jsecon.association.frame_superpixels import FrameSuperpixels, frame_superpixels, label_by_regions
 from jsecon.errors import InputError, join_first
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.evidence import IGNORED, pack_evidence, plan_evidence

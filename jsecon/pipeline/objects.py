@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.association.consensus import Objects, track_masks
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence
@@ -39,7 +39,7 @@ from jsecon.process import VIEWS_AT_ONCE, cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
-from jsecon.views.plan import LEAST_GAIN, frames_by_need
+from jsecon.views.placing import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import surfaces_from_depth

@@ -28,8 +28,8 @@ from jsecon.pipeline.model_loading import open_models
 from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console, Step
-from jsecon.pipeline.scene import plan_scene
 from jsecon.pipeline.scene_files import read_scene
+from jsecon.pipeline.scene_stages import plan_scene
 from jsecon.pipeline.sources import provenance
 from jsecon.pipeline.stages import (
     WARNING,
@@ -47,7 +47,7 @@ from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.read.masks.masks import load_proposals
-from jsecon.read.splats.points import load_point_cloud
+from jsecon.read.splats.point_clouds import load_point_cloud
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
 from jsecon.views.frame import field_up
 from jsecon.vision.classical import require_contrib

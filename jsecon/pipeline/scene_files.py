@@ -21,7 +21,7 @@ from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.pipeline.stages import WARNING
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
-from jsecon.read.splats.files import read_gaussians
+from jsecon.read.splats.formats import read_gaussians
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, Progress

@@ -19,7 +19,7 @@ from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.read.captures.capture import taken_on
-from jsecon.read.splats.points import read_crs
+from jsecon.read.splats.point_clouds import read_crs
 from jsecon.types import LanguageField
 
 

@@ -38,14 +38,14 @@ from jsecon.read.captures.frames import (
 from jsecon.read.captures.lens import undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, has_panorama_mark, is_video, write_frames
-from jsecon.read.splats.points import gaussians_of_cloud
+from jsecon.read.splats.point_clouds import gaussians_of_cloud
 from jsecon.splat.render import render_depth
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress, UpAxis
-from jsecon.views.capture import render_capture
 from jsecon.views.frame import find_up_axis, scene_frame, surface_points
-from jsecon.views.plan import DEFAULT_VIEWS, cover_with, place_cameras
+from jsecon.views.placing import DEFAULT_VIEWS, cover_with, place_cameras
+from jsecon.views.rendered import render_capture
 
 MIN_GAP_DB, MIN_GAP_SPREADS = 5.0, 5.0
 """Least distance below the median PSNR at which a frame is called weak, in dB, and in median absolute deviations."""
