@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.rivals.evidence import Evidence, unit
+from experiments.baselines.evidence import Evidence, unit
 from jsecon.association.consensus import track_masks
 from jsecon.association.frame_superpixels import SceneSuperpixels
 

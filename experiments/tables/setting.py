@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.baselines.evidence import Evidence
 from experiments.datasets.benchmark import Benchmark
 from experiments.datasets.feature_files import load_features, load_text_features
-from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import Association, Shared, associated
 from jsecon.fit.optimise import Schedule, fit_gaussians
