@@ -23,8 +23,8 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 import numpy as np
 from point_files import OFFSET, WRITERS
 
-from jsecon.read.splats.files import read_gaussians
-from jsecon.read.splats.points import load_point_cloud, save_point_cloud
+from jsecon.read.splats.formats import read_gaussians
+from jsecon.read.splats.point_clouds import load_point_cloud, save_point_cloud
 from jsecon.splat.points import nearest_gaussians
 
 NAMES = ("a.las", "a.laz", "a.e57", "binary.pcd", "compressed.pcd", "a.xyz", "points.ply")

@@ -33,8 +33,8 @@ from jsecon.paper.distill import distill_votes
 from jsecon.paper.queries import select_by_code
 from jsecon.query.answer import match_region, select_gaussians
 from jsecon.query.outliers import remove_outliers
-from jsecon.query.render import selection_mask
 from jsecon.query.rules import QueryRules
+from jsecon.query.selection_masks import selection_mask
 from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Capture, Codes, Gaussians, LanguageField, Regions
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import lerf, results
-from experiments.rivals.evidence import unit
+from experiments.baselines.evidence import unit
 from experiments.tables.answers import Steps
 from experiments.tables.association import overlaps
 from experiments.tables.fill import measure

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import lerf, real_words, results
-from experiments.rivals.evidence import unit
+from experiments.baselines.evidence import unit
 from experiments.tables import published
 from experiments.tables.answers import Answers, Steps
 from experiments.tables.association import Association, associated, overlaps

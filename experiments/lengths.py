@@ -23,7 +23,7 @@ from experiments.demo_rooms import fields_of_room
 from experiments.rooms.room import Room, crowded_room
 from jsecon.app.records import source_points
 from jsecon.errors import InputError
-from jsecon.query.solids import object_solid, surface_points
+from jsecon.query.solids import object_solid, object_surfaces
 from jsecon.types import LanguageField
 
 
@@ -56,7 +56,7 @@ def measure(field: LanguageField, room: Room) -> dict[str, float]:
         labels[answer.rows] = len(found)
         found.append((answer.place, ConvexHull(points).volume))
     volumes = []
-    for points, (place, volume) in zip(surface_points(field.gaussians, field.cameras, labels), found):
+    for points, (place, volume) in zip(object_surfaces(field.gaussians, field.cameras, labels), found):
         solid = object_solid(source_points(field, points), place)
         a, *rest = solid.size
         kinds = {"box": np.prod(solid.size), "cylinder": np.pi * a**2 * sum(rest), "sphere": 4 / 3 * np.pi * a**3}

@@ -27,7 +27,7 @@ from jsecon.app.pictures import selection_overlay
 from jsecon.evaluate.metrics import iou
 from jsecon.files import atomic_write
 from jsecon.fit.resize import resize_camera
-from jsecon.query.render import selection_mask
+from jsecon.query.selection_masks import selection_mask
 from jsecon.splat.render import render
 from jsecon.types import Array, Camera, Gaussians
 

@@ -27,13 +27,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import results
+from experiments.baselines.evidence import unit
+from experiments.baselines.lifting import READOUT, smoothed
 from experiments.cells import append_cell, read_cells
-from experiments.rivals.evidence import unit
-from experiments.rivals.lifting import READOUT, smoothed
 from experiments.words import rules
 from experiments.words.absent import absent_names
 from experiments.words.conse import Conse, Crop, Labeller, TextVectors, class_weights, conse
-from experiments.words.scenes import DEFAULT, GIVEN, RIVALS, WordScene, load_scene, rival_weights, scores_of
+from experiments.words.scenes import BASELINES, DEFAULT, GIVEN, WordScene, baseline_weights, load_scene, scores_of
 from jsecon.field.membership import normalise_votes
 from jsecon.query.answer import match_regions, query_anchored, query_several
 from jsecon.query.classes import query_classes
@@ -160,14 +160,14 @@ FIXED = (f"relevancy, smoothed, {READOUT}", "relevancy 0.5", f"cosine {MIN_COSIN
 
 
 def alone(name: str, masks: str, embedder: Callable[[], Conse], method: str) -> dict[str, list[float]]:
-    """Compares each Gaussian with the texts alone, by a method of RIVALS.
+    """Compares each Gaussian with the texts alone, by a method of BASELINES.
 
     Returns:
       reading -> (Q,) IoUs: at thresholds that are fixed (FIXED), and at those that are best on this very scene.
     """
     scene = load_scene(name, masks)
     case, truth, asked = case_of(scene, embedder(), VARIANTS[0]), scene.truth, scene.asked
-    features = unit(np.asarray(rival_weights(scene, method) @ case.crops, np.float64))
+    features = unit(np.asarray(baseline_weights(scene, method) @ case.crops, np.float64))
     cosine = rules.point_scores(features, case.texts, case.field.canonical_phrases, "cosine")
     relevancy = rules.point_scores(features, case.texts, case.field.canonical_phrases, "relevancy")
     smooth = smoothed(scene.gaussians.means, relevancy)
@@ -268,7 +268,7 @@ def main(options: Options) -> dict:
         for variant in VARIANTS:
             figures = kept(f"{k}, {variant}", measure_case, name, masks, embedder, variant)
             metrics["cases"][f"{k}, {variant}"] = figures | {"alone": {}}
-        for method in RIVALS:
+        for method in BASELINES:
             key = f"{k}, {VARIANTS[0]}"
             metrics["cases"][key]["alone"][method] = kept(f"{key}, {method}", alone, name, masks, embedder, method)
         metrics["lifting"][k] = kept(f"{k}, lifting", lifting, name, masks)
@@ -315,7 +315,7 @@ def tables(metrics: dict) -> list[str]:
     text.append(results.table(("rule", "embedder", "mean where chosen", *CASES), rows))
     every = {k: cases[f"{k}, {VARIANTS[0]}"]["alone"] for k in CASES}
     rows = []
-    for method in RIVALS:
+    for method in BASELINES:
         for reading in next(iter(every.values()))[method]:
             rows.append((method, reading, VARIANTS[0], *(_mean(every[k][method][reading]) for k in CASES)))
     text.append("Each Gaussian alone, IoU at the points; the best thresholds are chosen by the truth.")

@@ -23,10 +23,10 @@ import numpy as np
 import tyro
 
 from experiments import lerf, results
+from experiments.baselines.evidence import Evidence
 from experiments.cells import append_cell, read_cells
 from experiments.fair import ahead
 from experiments.memory_maps import clear_programs
-from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import associated
 from experiments.tables.ours import field_of

@@ -24,10 +24,10 @@ from experiments.datasets.named_objects import connected_parts
 from experiments.replica_apartment_0 import Options as Scan, load_replica, points_as_gaussians
 from experiments.simulated_vision.masks import Faults, simulated_masks
 from jsecon.association.consensus import track_masks
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 from jsecon.field.evidence import region_votes
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.views.plan import frames_by_need
+from jsecon.views.placing import frames_by_need
 
 LEAST_PX = 100
 """px of a mask; SAM's generator drops smaller ones"""

@@ -4,9 +4,9 @@
 
 Twins of LERF at medium noise. The rows are those of `experiments.fair` that need no training, each read as its paper
 does (by the relevancy) and by the centred cosine or "contrast" with a threshold or an ascent, for > 0.7 or > 10/255
-(the rivals' of linear and of sharp shares; ours of one region, and of all that answer): the best in that world on the
-seeds `--choosing`, for each figure its own. None may refuse a text. Methods that train take minutes a setting: those of
-`--scenes-trained` and `--seeds-trained` have them too, in tables of their own beside all the others there; a method
+(the baselines' of linear and of sharp shares; ours of one region, and of all that answer): the best in that world on
+the seeds `--choosing`, for each figure its own. None may refuse a text. Methods that train take minutes: those
+of `--scenes-trained` and `--seeds-trained` have them too, in tables of their own beside all the others there; a method
 that trains is read as is best on those very seeds, so that its figure is the most that a reading could give.
 """
 

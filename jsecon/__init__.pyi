@@ -43,10 +43,10 @@ from .query.match import RegionMatch as RegionMatch
 from .query.object_shapes import ObjectShapes as ObjectShapes, object_shapes as object_shapes
 from .query.outliers import remove_outliers as remove_outliers
 from .query.pointing import lift as lift, region_at as region_at
-from .query.render import selection_mask as selection_mask
 from .query.rules import QueryRules as QueryRules
+from .query.selection_masks import selection_mask as selection_mask
 from .read.captures.capture import load_capture as load_capture
-from .read.splats.files import load_gaussians as load_gaussians
+from .read.splats.formats import load_gaussians as load_gaussians
 from .read.splats.writing import save_gaussians as save_gaussians
 from .splat.capacity import plan_capacity as plan_capacity
 from .splat.plan import plan_view as plan_view, render_plan as render_plan

@@ -135,8 +135,8 @@ def _allgather_bytes(data: bytes) -> list[bytes]:
     if jax.process_count() == 1:
         return [data]
     size = 1 << 22
-    own = np.array(divmod(len(data), size), np.int32)
-    lengths = [int(pieces) * size + int(rest) for pieces, rest in process_allgather(own)]
+    my_size = np.array(divmod(len(data), size), np.int32)
+    lengths = [int(pieces) * size + int(rest) for pieces, rest in process_allgather(my_size)]
     parts = [bytearray() for _ in lengths]
     for begin in range(0, max(lengths), size):
         mine = np.frombuffer(data[begin : begin + size], np.uint8)

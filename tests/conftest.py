@@ -82,7 +82,7 @@ gc.freeze()
 gc.set_threshold(20_000, 20, 20)
 
 LONGEST = (
-    "compiling", "pipeline", "corrections", "fit", "views", "render", "blocks", "cores", "cli", "readme", "networks",
+    "compiling", "pipeline", "corrections", "fit", "views", "render", "cores", "cli", "readme", "networks",
     "capacity", "relations", "retrieval", "votes", "tiles", "anchored", "distill", "motion", "photometric", "evidence",
 )  # fmt: skip
 """files, without test_, that start first; files that use `room_run` come after test_pipeline, which makes it"""

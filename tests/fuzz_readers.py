@@ -36,8 +36,8 @@ from jsecon.read.captures import images, video
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.masks import masks
 from jsecon.read.masks.labels import LabelledFrame, load_lerf_labels
-from jsecon.read.splats.files import read_gaussians
-from jsecon.read.splats.points import load_point_cloud
+from jsecon.read.splats.formats import read_gaussians
+from jsecon.read.splats.point_clouds import load_point_cloud
 from jsecon.read.splats.writing import save_gaussians
 from jsecon.types import Capture, Codes, Gaussians, LanguageField, Regions
 

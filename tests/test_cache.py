@@ -39,8 +39,9 @@ def test_what_is_kept_comes_back_and_equal_values_give_equal_bytes(scene, camera
 
 
 def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
-    fresh = cache.fetch(tmp_path / "stage-0.safetensors", lambda: {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")})
-    again = cache.fetch(tmp_path / "stage-0.safetensors", lambda: pytest.fail("computed twice"))
+    path = tmp_path / "stage-0.safetensors"
+    fresh = cache.read_or_compute(path, lambda: {"a": jnp.arange(4.0), "b": (jnp.int32(3), "text")})
+    again = cache.read_or_compute(path, lambda: pytest.fail("computed twice"))
     assert (fresh[1:], again[1:]) == ((fresh[1], True), (fresh[1], False))
     for value, *_ in (fresh, again):
         assert isinstance(value["a"], np.ndarray)
@@ -54,14 +55,14 @@ def test_fresh_and_cached_are_the_same_numpy_trees(tmp_path):
 def test_a_damaged_file_is_said_and_computed_again(tmp_path, damage):
     value = np.random.default_rng(0).normal(size=500)
     path = tmp_path / "stage-k.safetensors"
-    cache.fetch(path, lambda: value)
+    cache.read_or_compute(path, lambda: value)
     path.write_bytes(damage(path.read_bytes()))
     said = []
-    kept, _, fresh = cache.fetch(path, lambda: value, note=said.append)
+    kept, _, fresh = cache.read_or_compute(path, lambda: value, note=said.append)
     assert fresh
     np.testing.assert_array_equal(kept, value)
     assert ["stage is computed again" in note for note in said] == [True]
-    assert not cache.fetch(path, lambda: value)[2]
+    assert not cache.read_or_compute(path, lambda: value)[2]
 
 
 def test_pickles_are_neither_written_nor_read_and_only_records_of_jsecon_are_made(tmp_path):
@@ -70,7 +71,7 @@ def test_pickles_are_neither_written_nor_read_and_only_records_of_jsecon_are_mad
     np.savez(tmp_path / "y.npz", a=np.array([object()], object), allow_pickle=True)
     with pytest.raises(InputError):
         cache.load(tmp_path / "y.npz")
-    for record in ("os:system", "jsecon.pipeline.cache:fetch", "jsecon.files:Path"):
+    for record in ("os:system", "jsecon.pipeline.cache:read_or_compute", "jsecon.files:Path"):
         with pytest.raises((ValueError, AttributeError)):
             unpack_tree({"record": record, "fields": {}}, {})
 

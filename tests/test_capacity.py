@@ -8,7 +8,7 @@ from reference import render_reference
 
 from jsecon.field.evidence import region_votes
 from jsecon.parallel import host_mesh
-from jsecon.query.render import selection_mask
+from jsecon.query.selection_masks import selection_mask
 from jsecon.splat.capacity import default_capacity
 from jsecon.splat.plan import prepare_views, render_plan
 from jsecon.splat.render import render, render_depth

@@ -24,7 +24,7 @@ from jsecon.pipeline import progress
 from jsecon.pipeline.options import Options, Range, check_ranges
 from jsecon.pipeline.progress import Console
 from jsecon.process import peak_memory_mib
-from jsecon.read.splats.files import load_gaussians
+from jsecon.read.splats.formats import load_gaussians
 from jsecon.splat.transform import transform_gaussians
 
 VERB_NAMES = [kind.__name__.lower() for kind in verbs.VERBS]

@@ -6,7 +6,7 @@ from balls import HEIGHT, VIEWS, WIDTH, ious, ring_of_balls
 from hypothesis import given, settings, strategies as st
 from scipy import sparse
 
-from jsecon.association import scene as association
+from jsecon.association import frame_superpixels as association
 from jsecon.association.consensus import (
     _average_linkage,
     _coplanarity,
@@ -16,7 +16,7 @@ from jsecon.association.consensus import (
     _piece_planes,
     track_masks,
 )
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 from jsecon.field.tree import node_members
 
 

@@ -197,3 +197,4 @@ def test_depths_and_masks_are_made_smaller_without_mixing(capture):
     unknown[:, 7] = unknown[2, 2] = True
     np.testing.assert_allclose(depth, np.where(unknown, 0, mean), rtol=1e-6)
     assert views[0].ignored.sum() == 1
+    assert views[0] is views[0]  # made smaller once, and not at every step

@@ -88,9 +88,10 @@ def test_they_are_of_all_kinds(door):
 def test_the_command_line(door, tmp_path, capsys):
     scene, file, _ = door
     options = ["--at", "frame_0", 36, 36, "--at", "#0", 45, 33]
-    assert run_cli("query", file, *TEXTS, *options, "--views", 0, "--out", tmp_path, "--json") == 0
+    texts = (*TEXTS, TEXTS[0])  # one of them twice
+    assert run_cli("query", file, *texts, *options, "--views", 0, "--out", tmp_path, "--json") == 0
     records = json.loads(capsys.readouterr().out)["answers"]
-    questions = (*TEXTS, *POINTED[:2])
+    questions = (*texts, *POINTED[:2])
     assert len(records) == len(questions)
     for question, record in zip(questions, records):
         answer = scene.ask(question)

@@ -18,7 +18,7 @@ from test_pipeline import Recorder
 from jsecon import load_capture, load_field, load_gaussians, save_field, save_gaussians
 from jsecon.files import exclusive_lock, reading, write_text
 from jsecon.pipeline import cache, run as pipeline
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 from jsecon.read.captures.images import write_image
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -71,7 +71,25 @@ def with_tree(field):
 def test_what_a_field_may_have_or_lack_comes_out(field, changed, tmp_path):
     whole = changed(field)
     save_field(tmp_path / "a.field", whole)
+    check_field(tmp_path / "a.field")
     assert_same(load_field(tmp_path / "a.field"), whole)
+
+
+def test_jit_compiles_once_for_fields_of_the_same_shapes(field):
+    """Their texts are not compiled for, stay where no trace is, and are not handed on by a compiled function."""
+    other = dataclasses.replace(field, names=tuple(f"other {name}" for name in field.names), embedder="another")
+    traces = []
+
+    @jax.jit
+    def moved(field):
+        traces.append((field.names, field.embedder, field.provenance))
+        return jax.tree.map(lambda a: a + 1, field)
+
+    results = [moved(field), moved(other)]
+    assert traces == [((), "", "{}")]
+    assert [(result.names, result.embedder) for result in results] == [((), "")] * 2
+    same = jax.tree.map(lambda a: a, other)
+    assert (same.names, same.embedder, same.provenance) == (other.names, other.embedder, other.provenance)
 
 
 def test_fields_that_do_not_fit_together_are_not_written(field, tmp_path):

@@ -11,7 +11,7 @@ from capture_files import refused, run_cli
 from conftest import cameras_of, gaussians_at, look_at
 
 from jsecon import load_capture, open_scene, render_rgb
-from jsecon.association.scene import SceneSuperpixels, label_by_regions, one_hot
+from jsecon.association.frame_superpixels import SceneSuperpixels, label_by_regions, one_hot
 from jsecon.poses.resection import MIN_INLIERS, pose_finder
 
 

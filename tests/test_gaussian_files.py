@@ -13,7 +13,7 @@ from splat_files import gaussians, opacity, scene, spz_record
 
 from jsecon import Gaussians, load_gaussians, save_gaussians
 from jsecon.read.splats import ply
-from jsecon.read.splats.files import read_gaussians
+from jsecon.read.splats.formats import read_gaussians
 from jsecon.splat import transform
 
 SCENE = scene(600, 4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jsecon import plan_capacity, render
-from jsecon.query.render import render_selection, selection_mask
+from jsecon.query.selection_masks import render_selection, selection_mask
 
 
 def cut_out(scene, chosen):

@@ -15,7 +15,7 @@ from photo_files import FOCAL, HEIGHT, WIDTH, apart, write_photos
 from PIL import Image
 
 from jsecon.pipeline.run import _compute_stages
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 from jsecon.poses import sfm
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, read_posed_images, unposed_photographs
@@ -171,7 +171,7 @@ def test_a_run_finds_the_poses_first_and_keeps_them_with_its_output_among_the_ph
     def again(**changes):
         context = context_of(folder, out, holdout=4, **changes)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jsecon.pipeline.scene.find_poses", copied)
+            patch.setattr("jsecon.pipeline.scene_stages.find_poses", copied)
             done = _compute_stages(context, plan_capture(context))
         return {step.name: step.status for step in done.steps}, " ".join(done.notes)
 
@@ -250,9 +250,9 @@ def test_what_lies_beside_photographs_and_is_not_used_is_named_in_the_plan(tmp_p
     for name in "abc":
         cv2.imwrite(str(tmp_path / f"{name}.jpg"), np.zeros((6, 8, 3), np.uint8))
     stage = plan_capture(context_of(tmp_path, tmp_path / "f"))[0]
-    assert "3 photographs" in stage.how
-    assert (others[0].partition("/")[0] in stage.how) == bool(says)
-    assert says in stage.how
+    assert "3 photographs" in stage.task
+    assert (others[0].partition("/")[0] in stage.task) == bool(says)
+    assert says in stage.task
 
 
 @pytest.mark.parametrize(("names", "head", "says"), [

@@ -12,7 +12,7 @@ from conftest import cameras_of
 from photo_files import apart
 from scipy.spatial.transform import Rotation
 
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 from jsecon.poses.sfm import find_poses
 from jsecon.read.captures.capture import load_capture, unposed_photographs
 from jsecon.read.captures.images import write_image
@@ -152,15 +152,15 @@ def test_wide_photographs_are_cut_only_where_their_camera_or_the_user_says_so(po
     assert len(capture.names) == COUNT
     assert capture.ignored is None
     (tmp_path / "transforms.json").unlink()
-    assert "Give --panoramas" in plan_capture(context_of(tmp_path, tmp_path / "out"))[0].how
-    declared = plan_capture(context_of(tmp_path, tmp_path / "out", panoramas=True))[0].how
+    assert "Give --panoramas" in plan_capture(context_of(tmp_path, tmp_path / "out"))[0].task
+    declared = plan_capture(context_of(tmp_path, tmp_path / "out", panoramas=True))[0].task
     assert "3 of them panoramas" in declared
     assert "--panoramas" not in declared
     image = cv2.imencode(".jpg", np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1].tobytes()
     xmp = b'http://ns.adobe.com/xap/1.0/\0<rdf:Description GPano:ProjectionType="equirectangular"/>'
     marked = image[:2] + b"\xff\xe1" + (len(xmp) + 2).to_bytes(2, "big") + xmp + image[2:]
     (tmp_path / "images" / "theta.jpg").write_bytes(marked)
-    assert "1 of them panoramas" in plan_capture(context_of(tmp_path, tmp_path / "out"))[0].how
+    assert "1 of them panoramas" in plan_capture(context_of(tmp_path, tmp_path / "out"))[0].task
     write_image(tmp_path / "images" / "phone.png", np.zeros((30, 40, 3), np.uint8))
     with refused("phone.png", "40x30", "twice as wide as high"):
         plan_capture(context_of(tmp_path, tmp_path / "out", panoramas=True))
@@ -180,7 +180,7 @@ def test_a_video_of_panoramas_is_told_by_its_header(tmp_path, mark):
 
     (tmp_path / "round.mp4").write_bytes(boxes(b"trak" + mark))
     (tmp_path / "walk.mp4").write_bytes(boxes(b"trak"))
-    plans = [plan_capture(context_of(tmp_path / f"{name}.mp4", tmp_path / "out"))[0].how for name in ("round", "walk")]
+    plans = [plan_capture(context_of(tmp_path / f"{name}.mp4", tmp_path / "out"))[0].task for name in ("round", "walk")]
     assert "the 50 sharpest panoramas of round.mp4" in plans[0]
     assert "the 150 sharpest frames of walk.mp4" in plans[1]
 

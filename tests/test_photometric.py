@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 
 from jsecon.fit.photometric import photometric_loss, psnr
 from jsecon.fit.quality import measure_quality, ssim_map
-from jsecon.pipeline.scene import is_weak
+from jsecon.pipeline.scene_stages import is_weak
 from jsecon.splat.points import gaussians_from_points
 
 

@@ -8,6 +8,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from capture_files import small_capture
 from mask_overlaps import iou_matrix
 
 from jsecon import InputError, load_field, save_gaussians
@@ -16,6 +17,8 @@ from jsecon.field.tree import part_objects
 from jsecon.files import write_arrays
 from jsecon.paper import autoencoder
 from jsecon.pipeline import cache, run as pipeline
+from jsecon.pipeline.objects import _TrainingView
+from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console, Step
 
 STAGES = ("load", "gaussians", "objects", "regions", "votes", "held_out")
@@ -114,6 +117,13 @@ def test_what_is_held_out_never_reaches_the_field(room_run, room, tmp_path):
         want, have = (jax.tree.leaves(getattr(r.field, name)) for r in (one, other))
         for a, b in zip(have, want, strict=True):
             np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def test_the_frames_in_which_masks_are_found_are_the_captures_own_or_one_copy():
+    capture = small_capture(5)
+    all_frames, four = (_TrainingView(capture, Options(Path("room")), np.arange(count)) for count in (5, 4))
+    assert np.shares_memory(all_frames.frames, capture.frames)
+    assert four.frames is four.frames
 
 
 def test_default_vision_finds_regions_by_itself(room, room_run, tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from splat_files import C0, PLY_NAMES, gaussians, opacity, ply_columns, scene, spz, write_ply
 
-from jsecon.read.splats.files import load_gaussians
+from jsecon.read.splats.formats import load_gaussians
 from jsecon.read.splats.writing import save_gaussians
 
 

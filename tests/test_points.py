@@ -11,9 +11,9 @@ from splat_files import write_ply
 from test_capture import moved
 
 from jsecon import InputError, load_gaussians
-from jsecon.read.splats import points as cloud_files
-from jsecon.read.splats.files import read_gaussians
-from jsecon.read.splats.points import load_point_cloud, read_crs, save_point_cloud
+from jsecon.read.splats import point_clouds as cloud_files
+from jsecon.read.splats.formats import read_gaussians
+from jsecon.read.splats.point_clouds import load_point_cloud, read_crs, save_point_cloud
 from jsecon.read.splats.writing import require_writable_format
 from jsecon.splat.points import nearest_gaussians
 from jsecon.splat.sh import C0

@@ -5,12 +5,16 @@ import re
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from capture_files import refused, small_capture, write_transforms
 
-from jsecon import InputError, process
+from jsecon import InputError, load_capture, process
+from jsecon.poses import sfm
 from jsecon.process import _settings as settings
+from jsecon.read.captures import build
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -67,3 +71,25 @@ def test_room_for_columns_is_half_of_what_is_free_or_what_the_user_says(monkeypa
 def test_peak_memory_is_in_mebibytes():
     (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert process.peak_memory_mib() == pytest.approx(int(peak) / 2**10, rel=0.01)
+
+
+@pytest.mark.parametrize("module", [build, sfm])
+def test_images_are_read_by_as_many_threads_as_the_process_may_use_cores(module, tmp_path, monkeypatch):
+    """As under taskset, and not by as many as the machine has; the first image that is cut ends the reading."""
+    workers = []
+
+    class CountedThreads(ThreadPoolExecutor):
+        def __init__(self, count):
+            workers.append(count)
+            super().__init__(count)
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.setattr(module, "ThreadPoolExecutor", CountedThreads)
+    monkeypatch.setattr(sfm, "require_pycolmap", lambda where: None)
+    write_transforms(small_capture(), tmp_path)
+    images = sorted((tmp_path / "images").iterdir())
+    for image in images:
+        image.write_bytes(image.read_bytes()[:-20])
+    with refused("cannot be read"):
+        load_capture(tmp_path) if module is build else sfm.find_poses(images, tmp_path / "work", where=tmp_path)
+    assert workers == [3]

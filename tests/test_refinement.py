@@ -9,7 +9,7 @@ from test_corrections import capture as capture, truth as truth  # fixtures
 from test_fit import same
 
 from jsecon.pipeline.run import _compute_stages
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 
 
 def load(folder, out, **options):
@@ -46,9 +46,9 @@ def test_without_depth_or_with_gaussians_nothing_is_tried(capture, tmp_path):
         (how(plain), how(plain, refine="never")),
         (how(deep, gaussians=plain), how(deep, refine="never")),
     ):
-        assert one.how == other.how
+        assert one.task == other.task
         assert one.key_options == other.key_options
     assert how(deep).key_options != how(deep, steps=300).key_options
-    assert "corrected by short fits in about half" in how(deep).how
-    assert how(deep, refine="always").how.endswith("corrected by short fits")
-    assert "corrected" not in how(deep, refine="never").how
+    assert "corrected by short fits in about half" in how(deep).task
+    assert how(deep, refine="always").task.endswith("corrected by short fits")
+    assert "corrected" not in how(deep, refine="never").task

@@ -10,7 +10,7 @@ from capture_files import context_of, refused, small_capture
 from scipy.spatial.transform import Rotation
 
 from jsecon import load_capture
-from jsecon.pipeline.scene import plan_capture
+from jsecon.pipeline.scene_stages import plan_capture
 from jsecon.read.captures.images import write_image
 
 _RANDOM = small_capture(count=12)

@@ -42,6 +42,21 @@ def test_the_region_of_another_field_selects_nothing_with_a_word(table):
     assert table.ask(Region(5)).reason == ""
 
 
+def test_a_field_without_harmonics_is_asked_and_measured_and_has_no_colours_to_export(tmp_path):
+    turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]])  # of its world, which turns harmonics
+    field, embedder = table_field(up=UP, source_from_scene=turn)
+    assert field.gaussians.sh is not None
+    scene, bare = (
+        Scene(dataclasses.replace(field, gaussians=dataclasses.replace(field.gaussians, sh=sh)), embedder)
+        for sh in (field.gaussians.sh, None)
+    )
+    for text in ("red mug", "the leftmost red mug"):
+        np.testing.assert_array_equal(bare.ask(text).rows, scene.ask(text).rows)
+    assert bare.measure("white plate", "orange ball") == scene.measure("white plate", "orange ball")
+    with pytest.raises(ValueError, match="Pass spherical harmonics"):
+        bare.export(tmp_path / "scene.ply")
+
+
 def test_a_node_of_the_tree_selects_the_gaussians_under_it():
     field, embedder = table_field()
     # The mugs and the bottle join step by step; the plate has two parts, of 40 and 80 Gaussians.

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from table_field import table_field
 
 from jsecon import object_shapes, save_field
-from jsecon.query.solids import object_solid, surface_points
+from jsecon.query.solids import object_solid, object_surfaces
 from jsecon.splat.points import gaussians_from_points
 
 
@@ -65,7 +65,7 @@ def test_surfaces_are_those_of_the_pixels_that_show_an_object():
     means[means[:, 2] > 2.5, 0] += 1.0  # behind the right half of the near wall
     walls = gaussians_from_points(means, np.full(means.shape, 128, np.uint8), opacity=0.99)
     view = cameras_of(np.eye(4)[None], (50.0, 50.0, 50.0, 40.0), 100, 80)
-    near, far = surface_points(walls, view, np.int64(means[:, 2] > 2.5))
+    near, far = object_surfaces(walls, view, np.int64(means[:, 2] > 2.5))
     assert np.ptp(near, axis=0)[2] < 1e-3
     np.testing.assert_allclose([near[:, 0].max(), near[0, 2], far[:, 0].min(), far[0, 2]], [1.2, 2, 1.8, 3], atol=0.1)
 

@@ -6,10 +6,12 @@ import json
 import pytest
 
 from jsecon import InputError, load_field, save_field
-from jsecon.app.scene import Scene
+from jsecon.app.scene import Scene, _field_of_gaussians
 from jsecon.field.field import Provenance
+from jsecon.pipeline import run as pipeline
 from jsecon.pipeline.model_loading import field_embedder
 from jsecon.pipeline.options import Options
+from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import locate_sources, provenance
 
 CLIP = "clip-0123456789abcdef"
@@ -40,6 +42,18 @@ def test_absolute_and_impossible_hints_lead_nowhere(field, tmp_path):
         own = told(field, folders={"points": hint, "embedder": hint}, options={"embedder": hint})
         save_field(tmp_path / "field.safetensors", own)
         assert locate_sources(load_field(tmp_path / "field.safetensors")) == (None, None, None)
+
+
+def test_the_field_of_a_splat_is_looked_for_with_its_own_model_unless_another_is_named(field, tmp_path, monkeypatch):
+    """As when it was made with --embedder and is asked without. test_scene.py has a whole run (long)."""
+    folder, embedders = tmp_path / "scene_field", []
+    for name in (folder, tmp_path / "clip"):
+        name.mkdir()
+    save_field(folder / "field.safetensors", told(field, folders={"embedder": "../clip"}))
+    monkeypatch.setattr(pipeline, "current_field", lambda options, out: embedders.append(options.embedder) or out)
+    for embedder in (None, "siglip2"):
+        _field_of_gaussians(Options(tmp_path / "scene.ply", embedder=embedder), folder, Console())
+    assert embedders == [tmp_path / "clip", "siglip2"]
 
 
 def test_a_model_of_another_name_is_not_opened(field, tmp_path):

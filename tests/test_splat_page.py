@@ -13,7 +13,7 @@ from small_field import answer_of, make_field
 
 from jsecon import region_at
 from jsecon.app.catalogue import main_regions
-from jsecon.app.viewer.page import NO_REGION, page
+from jsecon.app.viewer.page import NO_REGION, field_page
 from jsecon.errors import InputError
 from jsecon.splat.sh import C0
 from jsecon.types import Gaussians
@@ -28,7 +28,7 @@ def made(scene, cameras):
     mask = main_regions(field) == 1
     first = answer_of(field, "the second </script>", mask, region=1, score=0.75)
     answers = [first, answer_of(field, "nothing", 0 * mask, region=-1, score=0.01)]
-    return field, answers, page(field, {str(answer.query): answer for answer in answers}, title="A <room>")
+    return field, answers, field_page(field, {str(answer.query): answer for answer in answers}, title="A <room>")
 
 
 def read(text):
@@ -55,7 +55,7 @@ def test_a_page_holds_the_field_within_its_digits_at_any_size(made, size):
     means = np.asarray(field.gaussians.means) * np.float32(size)
     logs = np.asarray(field.gaussians.log_scales) + np.float32(np.log(size))
     field = with_gaussians(field, means=means, log_scales=logs)
-    told, columns = read(page(field, {str(answer.query): answer for answer in answers}, title="room"))
+    told, columns = read(field_page(field, {str(answer.query): answer for answer in answers}, title="room"))
     places = np.array(told["low"]) + columns["places"] / 65535 * np.array(told["span"])
     np.testing.assert_allclose(places, means, atol=max(told["span"]) / 65535)
     sizes = told["size_low"] + columns["sizes"] / 255 * told["size_span"]
@@ -73,15 +73,16 @@ def test_a_page_holds_the_field_within_its_digits_at_any_size(made, size):
         assert (text, kept["words"]) == (str(answer.query), answer.describe())
 
 
-def test_coincident_gaussians_and_opposite_cameras_have_a_page(made):
-    field, first = made[0], np.zeros(5, int)
+@pytest.mark.parametrize("count", [1, 5])
+def test_coincident_gaussians_and_opposite_cameras_have_a_page(made, count):
+    field, first = made[0], np.zeros(count, int)
     gaussians = jax.tree.map(lambda a: np.asarray(a)[first], field.gaussians)
     votes = jax.tree.map(lambda a: np.asarray(a)[first] if np.shape(a)[:1] == (64,) else a, field.votes)
     upside_down = np.array(field.cameras.world_to_camera)
     upside_down[1::2, :2] *= -1  # rolled by half a turn
     cameras = dataclasses.replace(field.cameras, world_to_camera=upside_down)
     one = dataclasses.replace(field, gaussians=gaussians, votes=votes, cameras=cameras)
-    scene, columns = read(page(one, {}, title="one"))
+    scene, columns = read(field_page(one, {}, title="one"))
     places = np.array(scene["low"]) + columns["places"] / 65535 * np.array(scene["span"])
     np.testing.assert_allclose(places, gaussians.means, atol=max(scene["span"]) / 65535)
     assert np.isfinite([scene["size_low"], scene["size_span"]]).all()
@@ -91,10 +92,10 @@ def test_coincident_gaussians_and_opposite_cameras_have_a_page(made):
 def test_what_is_huge_or_not_finite_is_left_out_and_without_a_visible_gaussian_there_is_no_page(made):
     logs, means = (np.array(getattr(made[0].gaussians, name)) for name in ("log_scales", "means"))
     logs[0], logs[1], means[3] = 20, -40, np.nan
-    told, _ = read(page(with_gaussians(made[0], log_scales=logs, means=means), {}, title="odd"))
+    told, _ = read(field_page(with_gaussians(made[0], log_scales=logs, means=means), {}, title="odd"))
     assert told["count"] == 62
     with pytest.raises(InputError, match="no visible Gaussian"):
-        page(with_gaussians(made[0], opacity_logits=np.full(64, -50, np.float32)), {}, title="none")
+        field_page(with_gaussians(made[0], opacity_logits=np.full(64, -50, np.float32)), {}, title="none")
 
 
 def test_a_page_asks_for_nothing_from_outside_and_no_text_breaks_it(made):
@@ -197,6 +198,6 @@ def test_a_pixel_is_as_deep_as_half_of_what_it_shows(made, tmp_path):
     found.depths = [0, right, -right].map(x => pick(canvas.width / 2 + x, canvas.height / 2).point?.[2]);
     answers.set("faint", { words: "", bits: new Uint8Array([2]) });
     await select(["faint"]); shown.only = true; found.alone = pick(canvas.width / 2, canvas.height / 2).point[2];"""
-    found = driven(page(field, {}, title="three"), script, tmp_path, width=800, height=600)
+    found = driven(field_page(field, {}, title="three"), script, tmp_path, width=800, height=600)
     assert found["depths"] == [pytest.approx(4, rel=1e-3), pytest.approx(2, rel=1e-3), None]
     assert found["alone"] == pytest.approx(2, rel=1e-3)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from balls import HEIGHT, WIDTH, ious, ring_of_balls
 
-from jsecon.association import scene as association
-from jsecon.association.scene import superpixels
+from jsecon.association import frame_superpixels as association
+from jsecon.association.frame_superpixels import superpixels
 from jsecon.paper.tracker import GeometricTracker
 
 
@@ -58,17 +58,17 @@ def test_bad_arguments_are_refused(world, tracker):
 
 
 @pytest.mark.parametrize("count", [1, 20, 200])
-def test_atoms_cover_the_frame_and_respect_the_masks(count):
+def test_superpixels_cover_the_frame_and_respect_the_masks(count):
     rng = np.random.default_rng(count)
     frame = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8)
     masks = np.zeros((2, 60, 80), bool)
     masks[0, 10:40, 10:50] = True
     masks[1, 20:50, 30:70] = True
-    atoms = superpixels(frame, masks, count=count)
-    areas = np.bincount(atoms.ravel())
+    labels = superpixels(frame, masks, count=count)
+    areas = np.bincount(labels.ravel())
     assert (areas >= 12).all()
-    for mask in masks:  # an atom lies in or out of a mask, but for the slivers that it took in
-        inside = np.bincount(atoms[mask], minlength=len(areas)) / areas
+    for mask in masks:  # a superpixel lies in or out of a mask, but for the slivers that it took in
+        inside = np.bincount(labels[mask], minlength=len(areas)) / areas
         assert np.mean((inside < 0.05) | (inside > 0.95)) > 0.5
         assert inside.max() > 0.95
     assert superpixels(frame, masks[:0], count=count).shape == (60, 80)

@@ -17,9 +17,9 @@ import jsecon
 from jsecon.app.cli import main
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
-from jsecon.views import plan
+from jsecon.views import placing
 from jsecon.views.frame import inner_scene, scene_frame, surface_points
-from jsecon.views.plan import frames_by_need, place_cameras
+from jsecon.views.placing import frames_by_need, place_cameras
 
 BALLS = {"red": (0.8, 0.1, 0.1), "blue": (0.1, 0.2, 0.8), "green": (0.1, 0.6, 0.15)}
 CENTRES = np.array([(-1.2, -0.8, 0.4), (1.0, 0.2, 0.4), (-0.2, 1.1, 0.4)])
@@ -67,8 +67,8 @@ def object_alone():
 def few_candidates():
     """A sixth of the views that are looked at."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "PLACES", 4)
-        patch.setattr(plan, "ORBIT_YAWS", 8)
+        patch.setattr(placing, "PLACES", 4)
+        patch.setattr(placing, "ORBIT_YAWS", 8)
         yield
 
 
@@ -198,9 +198,9 @@ SURROUNDINGS = {
 
 def test_frames_for_masks_are_those_that_show_what_others_do_not():
     outward, up = CENTRES * (1, 1, 0) / np.linalg.norm(CENTRES[:, :2], axis=1, keepdims=True), np.array([0, 0, 1.0])
-    poses = [plan._look(centre - 1.5 * way, way, up) for centre, way in zip(CENTRES, outward)]  # each shows one ball
-    away = plan._look(CENTRES[0] + (0, 0, 9), outward[0], up)
-    cameras = plan._cameras(np.stack([*[poses[0]] * 12, poses[1], poses[2], away]), 40, 30)
+    poses = [placing._look(centre - 1.5 * way, way, up) for centre, way in zip(CENTRES, outward)]  # each shows one ball
+    away = placing._look(CENTRES[0] + (0, 0, 9), outward[0], up)
+    cameras = placing._cameras(np.stack([*[poses[0]] * 12, poses[1], poses[2], away]), 40, 30)
     chosen = frames_by_need(scene_of(balls()), cameras)
     assert sorted(chosen[:3]) == [0, 12, 13]
     assert 14 not in chosen  # it shows nothing
@@ -282,7 +282,7 @@ def posed(around):
 def views_of(splat, **options):
     """The capture of renders that a run makes of a splat, its notes, and what the run plans."""
     result, stage = compute_stage(context_of(splat, splat.parent / "out", long_side=160, **options), "load")
-    return result.value, " ".join(result.notes), stage.how
+    return result.value, " ".join(result.notes), stage.task
 
 
 @pytest.mark.parametrize("kind", ["cameras.json", "transforms.json", "applied", "sparse"])

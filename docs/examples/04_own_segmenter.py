@@ -12,7 +12,7 @@ import numpy as np
 
 import jsecon
 from jsecon.association.consensus import track_masks
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 
 
 def segment(frame, index):

@@ -22,7 +22,7 @@ from jsecon.errors import InputError
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages
 from jsecon.read.captures.lens import Lens
-from jsecon.read.splats.points import load_point_cloud
+from jsecon.read.splats.point_clouds import load_point_cloud
 from jsecon.types import Capture
 
 REPLICA_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.rivals.evidence import Evidence, unit
+from experiments.baselines.evidence import Evidence, unit
 from jsecon.association.consensus import track_masks
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 
 ROWS = 64
 """The number of regions is padded to a multiple of this, so that scenes share compiled programs."""

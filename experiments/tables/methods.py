@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from experiments.baselines import lifting
+from experiments.baselines.evidence import Evidence
+from experiments.baselines.gaussian_grouping import GaussianGrouping, query_gaussian_grouping, train_gaussian_grouping
+from experiments.baselines.langsplat import LangSplat, train_langsplat
+from experiments.baselines.opengaussian import OpenGaussian, Schedule, train_instances, train_opengaussian
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
-from experiments.rivals import lifting
-from experiments.rivals.evidence import Evidence
-from experiments.rivals.gaussian_grouping import GaussianGrouping, query_gaussian_grouping, train_gaussian_grouping
-from experiments.rivals.langsplat import LangSplat, train_langsplat
-from experiments.rivals.opengaussian import OpenGaussian, Schedule, train_instances, train_opengaussian
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.ours import asked, paper
 from experiments.tables.setting import Setting

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.rivals.evidence import with_room
+from experiments.baselines.evidence import with_room
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.association import Association, associated, by_consensus
 from experiments.tables.codes import encode, region_codes

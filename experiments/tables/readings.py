@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from experiments.rivals import lifting
-from experiments.rivals.evidence import Evidence
+from experiments.baselines import lifting
+from experiments.baselines.evidence import Evidence
 from experiments.tables.answers import Answers
 from experiments.tables.setting import Setting
 from experiments.tables.silhouette import SILHOUETTE_WEIGHTS, fit_silhouette

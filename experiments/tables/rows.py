@@ -1,6 +1,6 @@
 """All rows of the fair tables, "method: reading": every method as published, and by the readings of `tables.readings`.
 
-What a method trains is trained once a setting and read often. Rivals whose papers give constants for other data than
+What a method trains is trained once a setting and read often. Baselines whose papers give constants for other data than
 LERF have a row for each.
 """
 
@@ -11,8 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.rivals import lifting
-from experiments.rivals.gaussian_grouping import query_gaussian_grouping
+from experiments.baselines import lifting
+from experiments.baselines.gaussian_grouping import query_gaussian_grouping
 from experiments.tables.answers import Answers, Method, Steps, by_selection
 from experiments.tables.methods import (
     METHODS,

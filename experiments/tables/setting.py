@@ -9,16 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.baselines.evidence import Evidence
 from experiments.datasets.benchmark import Benchmark
 from experiments.datasets.feature_files import load_features, load_text_features
-from experiments.rivals.evidence import Evidence
 from experiments.tables import twins
 from experiments.tables.association import Association, Shared, associated
 from jsecon.fit.optimise import Schedule, fit_gaussians
 from jsecon.fit.start import starting_gaussians
 from jsecon.fit.step import LearningRates
 from jsecon.read.masks.masks import load_labels
-from jsecon.read.splats.files import load_gaussians
+from jsecon.read.splats.formats import load_gaussians
 from jsecon.read.splats.writing import save_gaussians
 from jsecon.splat.points import gaussians_from_points
 from jsecon.types import Camera, Gaussians

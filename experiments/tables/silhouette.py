@@ -21,7 +21,7 @@ from jsecon.field.membership import SHARE_THRESHOLD
 from jsecon.fit.resize import scale_cameras
 from jsecon.numerics import MAX_ALPHA, MIN_ALPHA
 from jsecon.process import cores
-from jsecon.query.render import ALPHA_THRESHOLD
+from jsecon.query.selection_masks import ALPHA_THRESHOLD
 from jsecon.splat.plan import plan_view, render_plan
 from jsecon.splat.scan import pixel_centres, to_tiles
 from jsecon.splat.visible import HIDDEN_LOGIT

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from experiments import results
-from experiments.rivals.evidence import unit
+from experiments.baselines.evidence import unit
 from experiments.words.minilm import MiniLM
 from jsecon.errors import InputError, describe_error, require_one_of, require_shape
 from jsecon.vision.protocols import CANONICAL

@@ -23,12 +23,12 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from experiments import apc_bin, results
+from experiments.baselines import lifting
+from experiments.baselines.evidence import Evidence, unit
 from experiments.datasets import bonsai_outlines
 from experiments.datasets.depth_points import labels_of_points
 from experiments.datasets.named_objects import CLASSES, NEAR_M, connected_parts, names_of_objects
 from experiments.replica_apartment_0 import Options as Scan, load_replica, points_as_gaussians
-from experiments.rivals import lifting
-from experiments.rivals.evidence import Evidence, unit
 from experiments.words.conse import WORDS, Conse
 from jsecon.errors import InputError
 from jsecon.field.evidence import region_votes
@@ -46,7 +46,7 @@ GIVEN, DEFAULT = "given", "default"
 NAMED_POINTS = WORDS / "replica_apartment_0_named_points.npz"
 
 
-RIVALS: dict[str, Callable[[Evidence], sparse.csr_matrix]] = {
+BASELINES: dict[str, Callable[[Evidence], sparse.csr_matrix]] = {
     "weighted back-projection": lambda evidence: lifting.train_backprojection(evidence).weights,
     "Occam's LGS": lambda evidence: lifting.train_occam(evidence).weights,
     "VALA": lambda evidence: lifting.train_vala(evidence).weights,
@@ -296,9 +296,9 @@ def scores_of(scene: WordScene, embedder: Conse) -> np.ndarray:
     return np.stack([embedder.scores(scene.frames[t], mask[None])[0] for t, mask in zip(view, masks)])
 
 
-def rival_weights(scene: WordScene, method: str) -> sparse.csr_matrix:
-    """(N, C) weight of each crop on each Gaussian by a method of RIVALS."""
+def baseline_weights(scene: WordScene, method: str) -> sparse.csr_matrix:
+    """(N, C) weight of each crop on each Gaussian by a method of BASELINES."""
     gaussians, cameras = _on_device((scene.gaussians, scene.cameras))
     masks, _, view = scene.crops
     nothing = np.zeros((len(view), 1), np.float32)
-    return RIVALS[method](Evidence(gaussians, cameras, masks, nothing, view, scene.labels))
+    return BASELINES[method](Evidence(gaussians, cameras, masks, nothing, view, scene.labels))

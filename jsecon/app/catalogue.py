@@ -185,12 +185,12 @@ def objects(
     whole = _wholes(field, groups, members, size, surroundings)
     labels, part_labels = _assign(field, groups, whole)
     groups_of = zip(whole, _places(labels, len(whole)), _places(part_labels, len(whole)))
-    own = [parts if above >= 0 else wholes for above, wholes, parts in groups_of]
-    gaussians = np.array([len(group) for group in own], int)
+    rows_of = [parts if above >= 0 else wholes for above, wholes, parts in groups_of]
+    gaussians = np.array([len(group) for group in rows_of], int)
     shown, views = members @ pixels, np.asarray(field.votes.views)
     counts = np.count_nonzero(shown, axis=1)
-    sure = np.array([len(r) and n >= SURE_SHARE * np.median(views[r]) for n, r in zip(counts, own)], bool)
-    complete = np.array([_frames_around(field, group)[row > 0].sum() for row, group in zip(shown, own)], int)
+    sure = np.array([len(r) and n >= SURE_SHARE * np.median(views[r]) for n, r in zip(counts, rows_of)], bool)
+    complete = np.array([_frames_around(field, group)[row > 0].sum() for row, group in zip(shown, rows_of)], int)
     top, listed = np.where(whole < 0, np.arange(len(whole)), whole), gaussians >= MIN_SAMPLES
     order_of_wholes = (top, -gaussians[top], -complete[top], ~sure[top], surroundings[top])
     rows = np.lexsort((-gaussians, whole >= 0, *order_of_wholes))  # each part behind its whole
@@ -298,8 +298,8 @@ def _is_small(
     means = np.asarray(field.gaussians.means, np.float64)
 
     def sides(rows: np.ndarray) -> np.ndarray:
-        own = means[rows][np.isfinite(means[rows]).all(1)]
-        return np.ptp(np.quantile(own, (0.05, 0.95), axis=0), axis=0) if len(own) else np.full(3, np.inf)
+        finite = means[rows][np.isfinite(means[rows]).all(1)]
+        return np.ptp(np.quantile(finite, (0.05, 0.95), axis=0), axis=0) if len(finite) else np.full(3, np.inf)
 
     limit = SMALL_SHARE * np.median(sides(inner_scene(field.gaussians)))
     owned = _places(np.append(groups, -1)[main], int(groups.max(initial=-1)) + 1)
@@ -340,8 +340,8 @@ def _region_objects(field: LanguageField, main: np.ndarray, up: np.ndarray) -> I
 
     @functools.cache
     def shape(*regions: int) -> ObjectShapes:
-        own = gaussian_rows(plain, np.concatenate([np.flatnonzero(main == region) for region in regions]))
-        return object_shapes(own.means, np.zeros(own.count, int), up, spreads=gaussian_spreads(own))
+        chosen = gaussian_rows(plain, np.concatenate([np.flatnonzero(main == region) for region in regions]))
+        return object_shapes(chosen.means, np.zeros(chosen.count, int), up, spreads=gaussian_spreads(chosen))
 
     large = _counts(main, len(joined)) >= MIN_SAMPLES
     for first, second in np.argwhere(np.triu(alike & ~joined & large & large[:, None], 1)).tolist():
@@ -410,8 +410,8 @@ def _objects_of_gaussians(votes: Votes, objects: Int[Array, " r_and_1"]) -> Int[
 
 def _assign(field: LanguageField, groups: np.ndarray, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the whole (N,) and the part (N,) of each Gaussian."""
-    own, above = np.arange(len(whole)), np.append(whole, -1)  # the last entry is that of -1
-    columns = np.where(whole < 0, own, whole)[groups], np.where(whole < 0, -1, own)[groups]
+    ids, above = np.arange(len(whole)), np.append(whole, -1)  # the last entry is that of -1
+    columns = np.where(whole < 0, ids, whole)[groups], np.where(whole < 0, -1, ids)[groups]
     tops, parts = (jnp.asarray(np.append(column, -1).astype(np.int32)) for column in columns)
     labels, part_labels = [], []
     for votes in vote_blocks(field.votes):

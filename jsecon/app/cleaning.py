@@ -13,8 +13,8 @@ from jsecon.fit.photometric import psnr
 from jsecon.fit.quality import measure_quality
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
-from jsecon.pipeline.scene import open_bare_scene
 from jsecon.pipeline.scene_files import fit_background, place_in_capture, read_scene
+from jsecon.pipeline.scene_stages import open_bare_scene
 from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.splats.writing import require_writable_format, save_gaussians

@@ -23,7 +23,7 @@ from jsecon.splat.points import back_project, gaussians_from_points
 from jsecon.splat.render import render_depth
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, LanguageField
-from jsecon.views.capture import render_capture
+from jsecon.views.rendered import render_capture
 from jsecon.vision.protocols import Embedder
 
 LONG_SIDE = 320
@@ -53,12 +53,12 @@ class Changes:
     def _record(self, change: Change) -> dict[str, Any]:
         field, listed, index = self.field, self.catalogue, change.object
         now, start = source_points(field, np.stack([change.place, change.start]))
-        kind, own = change.suspected or change.kind, np.flatnonzero(listed.regions == index)
+        kind, regions = change.suspected or change.kind, np.flatnonzero(listed.regions == index)
         known: dict[str, Any] = {"name": "", "id": None, "region": None}
         if index >= 0:
             # The region that shows most of an object is its name for good; an object's id belongs to one field.
-            pixels = np.asarray(field.regions.pixel_counts)[own].sum(1)
-            known = {"name": str(listed.names[index]), "id": index, "region": int(own[pixels.argmax()])}
+            pixels = np.asarray(field.regions.pixel_counts)[regions].sum(1)
+            known = {"name": str(listed.names[index]), "id": index, "region": int(regions[pixels.argmax()])}
         return {
             "kind": change.kind,
             **({"suspected": change.suspected} if change.suspected else {}),

@@ -22,7 +22,7 @@ from jsecon.files import parse_json, remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.query.outliers import MIN_SAMPLES
-from jsecon.query.solids import object_solid, surface_points
+from jsecon.query.solids import object_solid, object_surfaces
 from jsecon.read.splats.writing import require_writable_format
 
 _Item: TypeAlias = dict[str, Any]
@@ -211,7 +211,7 @@ def _write_shapes(scene: Scene, listed: Catalogue, out: Path) -> list[Path]:
     for n, record in enumerate(wholes):
         labels[listed.mask(record["id"])] = n
     items = []
-    for record, points in zip(wholes, surface_points(field.gaussians, field.cameras, labels)):
+    for record, points in zip(wholes, object_surfaces(field.gaussians, field.cameras, labels)):
         shape = listed.shapes[record["id"]]
         solid = object_solid(source_points(field, points), shape)
         hull = {"vertices": scale * solid.vertices, "triangles": solid.triangles, "volume": scale**3 * solid.volume}

@@ -24,8 +24,8 @@ def _list_models(console: Console) -> verbs.VerbResult:
     console.print_line(columns("name", "role", "MB", "here", "licence", "adds"))
     for row in hub.catalogue():
         cached = row.cached_folder is not None
-        here = "yes" if cached else "-"
-        console.print_line(columns(row.name, row.role, row.megabytes, here, row.licence, row.purpose))
+        mark = "yes" if cached else "-"
+        console.print_line(columns(row.name, row.role, row.megabytes, mark, row.licence, row.purpose))
         rows.append(dataclasses.asdict(row) | {"cached": cached})
     console.print_line("jsecon models get NAME fetches one; hub:owner/name is any other repository of huggingface.co.")
     return {"models": rows}

@@ -28,7 +28,7 @@ from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.outliers import remove_outliers
 from jsecon.query.parts import match_parts
 from jsecon.query.pointing import frame_index
-from jsecon.query.referring import evaluate, with_everything
+from jsecon.query.referring import find_referents, with_everything
 from jsecon.query.relations import Viewpoint, order_values, viewpoint
 from jsecon.query.rules import ABSENT, FOUND, MIN_RANK, QueryRules
 from jsecon.read.captures.frames import transform_poses
@@ -56,7 +56,7 @@ def choose_shades(
     for text in texts:
         narrower = embedder.narrower(text)
         best: list[str] = []
-        if narrower and int((own := match(text, rules)).state) < FOUND:
+        if narrower and int((plain := match(text, rules)).state) < FOUND:
             # Of n attempts one succeeds by chance as often as one attempt that is n times as strict.
             least = MIN_RANK if rules.min_rank is None else rules.min_rank
             strict = dataclasses.replace(rules, min_rank=1 - (1 - least) / len(narrower))
@@ -64,7 +64,7 @@ def choose_shades(
             best = sorted(
                 (o for o, m in matches.items() if int(m.state) == FOUND), key=lambda o: float(matches[o].score)
             )
-            if int(own.state) > ABSENT and int(own.region) not in [int(matches[option].region) for option in best]:
+            if int(plain.state) > ABSENT and int(plain.region) not in [int(matches[option].region) for option in best]:
                 best = []  # the match is another thing, which no shade fits
         replaced.extend(best[0 if every else -1 :] or [text])
     return replaced
@@ -118,7 +118,7 @@ class ObjectIndex:
         named = set(owners[self._is_best_name(texts, regions)].tolist()) - {-1}
         things = sorted(named or set(owners.tolist()) - {-1})
         found = [self._object(phrase, n, int(match.state)) for n in things]
-        return [one for one in found if len(one.rows)]
+        return [thing for thing in found if len(thing.rows)]
 
     def find_parts(self, part: str, whole: str) -> list[Object]:
         """Finds the parts that a text names of each thing that another one names; "part" names all of them.
@@ -134,12 +134,12 @@ class ObjectIndex:
             wholes = self._objects_of(whole)
         except InputError:
             return []
-        for one in wholes:
-            nodes, state = np.asarray(field.part_nodes)[np.isin(part_objects(field), one.regions)], one.state
+        for thing in wholes:
+            nodes, state = np.asarray(field.part_nodes)[np.isin(part_objects(field), thing.regions)], thing.state
             if texts is not None:
-                nodes, state = match_parts(field, texts, self._rules, one.regions)
-            found += [self._part(f"{part} of {one.phrase}", int(node), state) for node in nodes]
-        return [one for one in found if len(one.rows)]
+                nodes, state = match_parts(field, texts, self._rules, thing.regions)
+            found += [self._part(f"{part} of {thing.phrase}", int(node), state) for node in nodes]
+        return [thing for thing in found if len(thing.rows)]
 
     def _part(self, phrase: str, node: int, state: int) -> Object:
         """A part of an object as an object of its own."""
@@ -211,7 +211,7 @@ class ObjectIndex:
         units = 1.0, 1.0 / (metres or 1.0)
         view, words = self._view(query.frame)
         readings = expression.readings()
-        outcomes = [evaluate(self._objects_of, expression.thing, reading, view, units) for reading in readings]
+        outcomes = [find_referents(self._objects_of, expression.thing, reading, view, units) for reading in readings]
         place = next((n for n, outcome in enumerate(outcomes) if outcome.chosen), 0)
         best, others = outcomes[place], outcomes[place + 1 :]
         chosen = {found.regions for found in best.chosen}

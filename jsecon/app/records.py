@@ -320,10 +320,10 @@ def source_shapes(
     field: LanguageField, rows: np.ndarray, labels: np.ndarray, up: np.ndarray | None = None
 ) -> ObjectShapes:
     """Measures objects in the capture's world: `labels` are those of the Gaussians `rows` (`object_shapes`)."""
-    plain = dataclasses.replace(field.gaussians, sh=field.gaussians.sh[:, :1])  # shapes have no colours
-    taken = gaussian_rows(plain, rows)
-    spreads = gaussian_spreads(transform_gaussians(taken, field.source_from_scene))
-    return object_shapes(source_points(field, np.asarray(taken.means)), labels, up, spreads=spreads)
+    plain = dataclasses.replace(field.gaussians, sh=None)  # shapes have no colours
+    chosen = gaussian_rows(plain, rows)
+    spreads = gaussian_spreads(transform_gaussians(chosen, field.source_from_scene))
+    return object_shapes(source_points(field, np.asarray(chosen.means)), labels, up, spreads=spreads)
 
 
 def gaussian_rows(gaussians: Gaussians, ids: Int[np.ndarray, " m"]) -> Gaussians:

@@ -47,10 +47,10 @@ from jsecon.query.expressions import is_expression, parse_query, split_part
 from jsecon.query.object_shapes import ObjectShapes
 from jsecon.query.parts import match_parts
 from jsecon.query.pointing import OUTSIDE, UNKNOWN, frame_index, lift, region_at
-from jsecon.query.render import selection_mask
 from jsecon.query.rules import FOUND, ONE_REGION, STATES, UNSURE, QueryRules
+from jsecon.query.selection_masks import selection_mask
 from jsecon.read.captures.frames import move_capture, take_frames
-from jsecon.read.splats.points import load_point_cloud, save_point_cloud
+from jsecon.read.splats.point_clouds import load_point_cloud, save_point_cloud
 from jsecon.read.splats.writing import save_gaussians
 from jsecon.splat.points import nearest_gaussians
 from jsecon.splat.transform import transform_gaussians
@@ -467,12 +467,12 @@ class Scene:
         """Selects the object that a box or masks outline in frames."""
         self._require_memory("an outline")
         frames = question.frames if isinstance(question, Mask) else {question.frame: self._box_mask(question)}
-        given = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
-        if len(given) < len(frames):
+        masks_by_frame = {frame_index(self.field, frame): mask for frame, mask in frames.items()}
+        if len(masks_by_frame) < len(frames):
             raise InputError("mask", "a frame has two masks", remedy="Give one mask of an object in each frame.")
-        masks = np.stack([np.asarray(mask, int) for mask in given.values()])
+        masks = np.stack([np.asarray(mask, int) for mask in masks_by_frame.values()])
         threshold = SHARE_THRESHOLD if query.threshold is None else query.threshold
-        selection = lift(self.field, masks, list(given), threshold=threshold)
+        selection = lift(self.field, masks, list(masks_by_frame), threshold=threshold)
         mask, _ = trim(self.field, selection, "supported" if query.outliers else None)
         return self._finish(query, (selection, mask, 1))
 
@@ -676,7 +676,7 @@ class Scene:
         mask = np.zeros(self.field.gaussians.count, bool)
         for event, _ in found:
             mask[np.asarray(event.rows)] = True
-        words = [f"{told['name'] or 'something'} {told['kind']} {told['date']}" for _, told in found]
+        words = [f"{record['name'] or 'something'} {record['kind']} {record['date']}" for _, record in found]
         reason = "; ".join(words) or "the history of the field has no such change (jsecon update)"
         region, score = np.asarray(-1, np.int32), np.asarray(float(len(found) > 0), np.float32)
         selection = Selection(mask, mask.astype(np.float32), region, score)
@@ -786,7 +786,7 @@ class Scene:
             if cloud is None:
                 problem, remedy = "the field has no file of points that is still there", "Make it of one, or keep that."
                 raise InputError(f"scene {self.name}", problem, remedy=remedy)
-            placed = transform_gaussians(dataclasses.replace(gaussians, sh=gaussians.sh[:, :1]), world)
+            placed = transform_gaussians(dataclasses.replace(gaussians, sh=None), world)
             near = nearest_gaussians(load_point_cloud(cloud).points, placed)
             rows = np.arange(len(near)) if mask is None else np.flatnonzero(np.append(mask, False)[near])
             ids = {name: np.append(column, np.int32(-1))[near[rows]] for name, column in ids.items()}

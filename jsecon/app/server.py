@@ -37,7 +37,7 @@ from jsecon.app import verbs
 from jsecon.app.opening import find_scene, name_fields
 from jsecon.app.records import Answer, At, Query, Region
 from jsecon.app.scene import Scene, open_prepared
-from jsecon.app.viewer.page import answer_record, drawn_gaussians, page
+from jsecon.app.viewer.page import answer_record, drawn_gaussians, field_page
 from jsecon.change.history import events
 from jsecon.errors import InputError, describe_error
 from jsecon.field.membership import SHARE_THRESHOLD
@@ -264,7 +264,7 @@ def page_application(scene: Scene, texts: Sequence[str] = ()) -> FastAPI:
     """Makes the ASGI application of a scene's page, which highlights some texts when it opens."""
     scenes = {scene.name: scene}
     drawn = drawn_gaussians(scene.field)[0]
-    content = page(scene.field, dict.fromkeys(texts), title=scene.name, served=True).encode()
+    content = field_page(scene.field, dict.fromkeys(texts), title=scene.name, served=True).encode()
     app = application(scenes)
 
     @app.get("/", summary="The page")

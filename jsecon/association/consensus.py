@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, Int32, Integer, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, SceneSuperpixels, Sparse, assign_superpixels, one_hot
+from jsecon.association.frame_superpixels import FrameSuperpixels, SceneSuperpixels, Sparse, assign_superpixels, one_hot
 from jsecon.errors import require
 from jsecon.types import Progress
 from jsecon.vision.region_graph import relabel_sequential
@@ -160,8 +160,8 @@ def _parts_within(
         if not piece.any():
             part[rows], first = first, first + 1
             continue
-        own = membership[rows], visible[rows], weights[rows], means[rows]
-        links = _linked(piece, *own, surface_width, agreement)
+        columns = membership[rows], visible[rows], weights[rows], means[rows]
+        links = _linked(piece, *columns, surface_width, agreement)
         group, _ = _average_linkage(*links, least_ratio=PART_AGREEMENT, least_shared=0.02)
         _, pairs = _average_linkage(*_merged(group, *links), least_ratio=0.0)
         part[rows] = first + group[piece]
@@ -451,18 +451,18 @@ def _visible_parts(
     object_of = np.append(objects, -1)[leaf]
     inside = one_hot(leaf, len(tree)) @ under[nodes].T  # (N, P)
     shown, masks = np.zeros(len(nodes), int), []
-    for view, own in zip(views, labels):
+    for view, view_labels in zip(views, labels):
         item = np.full(view.proposals.shape[1], -1)
-        item[view.labels] = own
+        item[view.labels] = view_labels
         seen = view.votes.T.tocsr()
         of_objects = (seen @ one_hot(object_of[view.seen], count)).toarray()
         mask = (seen @ inside[view.seen]).toarray() >= 0.5 * of_objects[:, objects[nodes]]
         mask &= (item[:, None] == objects[nodes]) & (of_objects[:, objects[nodes]] > 0)
-        area, here = np.bincount(view.labels.reshape(-1)).astype(np.float32), np.flatnonzero(mask.any(0))
-        both = (view.proposals * area) @ mask[:, here]
-        fit = both / np.maximum((view.proposals @ area)[:, None] + area @ mask[:, here] - both, 1.0)
+        area, visible_nodes = np.bincount(view.labels.reshape(-1)).astype(np.float32), np.flatnonzero(mask.any(0))
+        both = (view.proposals * area) @ mask[:, visible_nodes]
+        fit = both / np.maximum((view.proposals @ area)[:, None] + area @ mask[:, visible_nodes] - both, 1.0)
         if fit.size:  # a mask shows the part that it fits best
-            shown[here[np.unique(fit.argmax(1)[fit.max(1) >= 0.5])]] += 1
+            shown[visible_nodes[np.unique(fit.argmax(1)[fit.max(1) >= 0.5])]] += 1
         masks.append(mask)
     above = under[nodes][:, nodes].toarray() > 0  # (P, P) whether one lies in another, or is the same
     alike = above & (total[nodes] > 0.5 * total[nodes][:, None])
@@ -476,8 +476,8 @@ def _visible_parts(
     result = np.full((int(layer.max(initial=0)) + 1, *labels.shape), -1, np.int16)
     for t, (view, mask) in enumerate(zip(views, masks)):
         part = np.full((len(result), view.proposals.shape[1]), -1, np.int16)
-        for n, own in enumerate(mask[:, kept].T):
-            part[layer[n], own] = n
+        for n, inside_it in enumerate(mask[:, kept].T):
+            part[layer[n], inside_it] = n
         result[:, t] = part[:, view.labels]
     return result, nodes[kept].astype(np.int32)
 
@@ -522,7 +522,7 @@ def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse,
     masks are squared and normalised, which favours the majority. Overlapping masks divide it, so that a frame with many
     levels of masks counts no more than one with a single partition.
     """
-    shares, looks, weights, start = [], [], np.zeros(count, np.float64), 0
+    shares, visibilities, weights, start = [], [], np.zeros(count, np.float64), 0
     for t, view in enumerate(views):
         totals = view.totals
         weights[view.seen] += totals
@@ -537,10 +537,10 @@ def _mask_signatures(views: list[FrameSuperpixels], count: int) -> tuple[Sparse,
         keep = share >= 0.05 / layers  # less is an edge's blur
         share = (share * np.sqrt(layers) * view.clarity[cast.row])[keep].astype(np.float32)
         shares.append((share, view.seen[cast.row[keep]], start + cast.col[keep]))
-        looks.append((visibility.astype(np.float32), view.seen, np.full(len(view.seen), t)))
+        visibilities.append((visibility.astype(np.float32), view.seen, np.full(len(view.seen), t)))
         start += len(view.proposals)
     matrices = []
-    for entries, width in ((shares, start), (looks, len(views))):
+    for entries, width in ((shares, start), (visibilities, len(views))):
         values, rows, columns = (np.concatenate(parts) for parts in zip(*entries))
         matrices.append(sparse.csr_matrix((values, (rows, columns)), shape=(count, width)))
     membership, visible = matrices

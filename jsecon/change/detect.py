@@ -144,10 +144,10 @@ class _Body:
 
     def __init__(self, gaussians: Gaussians, rows: np.ndarray, up: np.ndarray):
         means = np.asarray(gaussians.means, np.float64)
-        own = means[rows]
-        self.middle = np.median(own, axis=0)
-        self.foot = self.middle + (np.quantile(own @ up, 0.03) - self.middle @ up) * up
-        self.extent = float(np.linalg.norm(np.quantile(own, 0.95, 0) - np.quantile(own, 0.05, 0))) / np.sqrt(2)
+        points = means[rows]
+        self.middle = np.median(points, axis=0)
+        self.foot = self.middle + (np.quantile(points @ up, 0.03) - self.middle @ up) * up
+        self.extent = float(np.linalg.norm(np.quantile(points, 0.95, 0) - np.quantile(points, 0.05, 0))) / np.sqrt(2)
         step = -(-len(rows) // 3000) or 1  # of a large object every second or third Gaussian is a larger disc
         rows = rows[::step]
         self.means, sizes = means[rows], np.asarray(gaussians.log_scales, np.float64)[rows]
@@ -313,8 +313,8 @@ def object_changes(
     """
     require_shape("labels", labels, (gaussians.count,), "Give one label per Gaussian.")
     gaussians, cameras = jax.tree.map(np.asarray, (gaussians, cameras))
-    given = [None] * len(frames) if depths is None else depths
-    views = [_first_view(gaussians, camera, frame, depth) for camera, frame, depth in zip(cameras, frames, given)]
+    depth_maps = [None] * len(frames) if depths is None else depths
+    views = [_first_view(gaussians, camera, frame, depth) for camera, frame, depth in zip(cameras, frames, depth_maps)]
     for t, view in enumerate(views):
         explained = float((view.cost < 0.5).mean())
         if explained < MIN_EXPLAINED:
@@ -332,7 +332,7 @@ def object_changes(
     turned = (seen.sum(1) > 1) & (differing.sum(1) >= TURN_SHARE * known.sum(1)) & ~(seen.any(1) & (excess > 0))
     turns = search.turns({k: changes[k].frames for k in np.flatnonzero(turned).tolist()})
     search.remove(displaced, list(turns))
-    moved = {k: search.settle(k, *turn) for k, turn in turns.items()} | search.moved()
+    moved = {k: search.place_object(k, *turn) for k, turn in turns.items()} | search.moved()
     changes |= moved
     clusters = search.clusters()
     for k in displaced:
@@ -486,10 +486,10 @@ class _Search:
             if not fits:
                 break
             best = max(fits, key=lambda fit: fit.total)
-            result[best.object] = self.settle(best.object, best.motion, 14 * (best.gain - MIN_GAIN) + 0.5)
+            result[best.object] = self.place_object(best.object, best.motion, 14 * (best.gain - MIN_GAIN) + 0.5)
         return result
 
-    def settle(self, k: int, motion: np.ndarray, evidence: float) -> Change:
+    def place_object(self, k: int, motion: np.ndarray, evidence: float) -> Change:
         """Puts an object into the views where it is now; `evidence` is the logit of its probability."""
         self.views, masks = map(list, zip(*(view.place(self.body(k), motion) for view in self.views)))
         after, pixels = np.stack(masks), np.sum(masks, axis=(1, 2))

@@ -18,7 +18,7 @@ import numpy as np
 from jsecon.errors import InputError
 from jsecon.evaluate.metrics import accuracy_at, iou, localization_accuracy, mean_iou
 from jsecon.fit.resize import resize_camera
-from jsecon.query.render import ALPHA_THRESHOLD, render_selection
+from jsecon.query.selection_masks import ALPHA_THRESHOLD, render_selection
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.types import Camera, Gaussians, Progress, Selection
 

@@ -32,9 +32,9 @@ def votes_of_rows(votes: Votes, rows: slice | Int[np.ndarray, " m"]) -> Votes:
     def take(column):
         return None if column is None else np.asarray(column[rows])
 
-    own = {"overflow", "num_regions", "by_view", "overlap"}
+    others = {"overflow", "num_regions", "by_view", "overlap"}
     columns = {
-        field.name: take(getattr(votes, field.name)) for field in dataclasses.fields(votes) if field.name not in own
+        field.name: take(getattr(votes, field.name)) for field in dataclasses.fields(votes) if field.name not in others
     }
     return dataclasses.replace(votes, **columns, by_view=None, overlap=None)
 

@@ -369,16 +369,16 @@ def _scan_votes(
         plan = plan_view(gaussians, camera, capacity=capacity, near=near)
 
         def emit(state, chunk, slots, sums, largest):
-            own, peak = state
+            view_weights, peak = state
             target = jnp.where(slots >= 0, slots, num_regions + 1)[:, None]  # an empty slot's are dropped
-            own = own.at[chunk.ids[:, :, None], target].add(sums, mode="drop")
-            return own, peak.at[chunk.ids].max(largest)
+            view_weights = view_weights.at[chunk.ids[:, :, None], target].add(sums, mode="drop")
+            return view_weights, peak.at[chunk.ids].max(largest)
 
         weights, total, peak, views, overflow = state
         names = _tile_labels(plan, _named(image.astype(jnp.int32), num_regions))[:2]
-        own, peak = _scan_regions(plan, names, centre_pixel_weight, (jnp.zeros_like(weights), peak), emit)
-        seen = own.sum(1)
-        state = weights + own, total + seen, peak, views + (seen > 0), overflow + plan.overflow
+        view_weights, peak = _scan_regions(plan, names, centre_pixel_weight, (jnp.zeros_like(weights), peak), emit)
+        seen = view_weights.sum(1)
+        state = weights + view_weights, total + seen, peak, views + (seen > 0), overflow + plan.overflow
         return state, seen if by_view else None
 
     nothing = jnp.zeros(count, dtype)
@@ -453,12 +453,12 @@ def _sum_rows(views: Sequence[ViewEvidence], rows: slice, num_regions: int, by_v
     dense = np.zeros((count, num_regions + 1) if len(views) != 1 else (0, 0))
     for t, view in enumerate(views):
         shape = len(view.gaussians), num_regions + 1
-        own = sparse.csr_matrix((view.weights, view.regions, view.starts), shape) @ np.ones(num_regions + 1)
-        total[view.gaussians] += own
+        view_totals = sparse.csr_matrix((view.weights, view.regions, view.starts), shape) @ np.ones(num_regions + 1)
+        total[view.gaussians] += view_totals
         seen[view.gaussians] += 1
         peak[view.gaussians] = np.maximum(peak[view.gaussians], view.max_pixel_weights)
         if by_view:
-            each[view.gaussians, t] = own
+            each[view.gaussians, t] = view_totals
         if dense.size:
             cells = np.repeat(view.gaussians.astype(np.int64) * (num_regions + 1), np.diff(view.starts)) + view.regions
             np.add.at(dense.reshape(-1), cells, view.weights.astype(np.float64))

@@ -216,11 +216,11 @@ def _oddity(field: LanguageField, checked: bool = True) -> str | None:
 
 def _is_tree(parent: np.ndarray, count: int) -> bool:
     """Whether these are the parents of the nodes of a tree over `count` regions and their parts."""
-    own = np.arange(len(parent))
+    ids = np.arange(len(parent))
     if parent.dtype.kind != "i" or len(parent) < count:
         return False
-    above = (parent > own) & (parent >= count) & (parent < len(parent))
-    of_region = (own >= count) & (parent >= 0) & (parent < count)
+    above = (parent > ids) & (parent >= count) & (parent < len(parent))
+    of_region = (ids >= count) & (parent >= 0) & (parent < count)
     if not (above | of_region | (parent == -1)).all():
         return False
     for _ in range(len(parent).bit_length()):  # no node is above itself

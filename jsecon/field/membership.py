@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
 from jsecon.field.columns import ROWS, is_mapped, row_slices, votes_of_rows
-from jsecon.field.regions import ALIKE_THRESHOLD, mean_residuals
+from jsecon.field.regions import DUPLICATE_COSINE, mean_residuals
 from jsecon.numerics import FULL_PRECISION, array_module, cosine_matrix, inline_jit
 from jsecon.process import cores
 from jsecon.programs import stored_jit
@@ -115,7 +115,7 @@ def _by_view(votes: Votes, regions: Regions) -> Array:
 def _views_that_show(regions: Regions) -> Bool[Array, "r t"]:
     """Finds the views (R, T) that show a region, or one that is alike: regions that queries join are shown together."""
     apart, known = mean_residuals(regions.embeddings)
-    alike = cosine_matrix(apart, apart) >= ALIKE_THRESHOLD
+    alike = cosine_matrix(apart, apart) >= DUPLICATE_COSINE
     alike = (alike & known[:, None] & known[None]) | np.eye(regions.count, dtype=bool)
     return (alike.astype(np.float32) @ (regions.pixel_counts > 0).astype(np.float32)) > 0
 
@@ -232,9 +232,9 @@ def _add_columns(votes: Votes, inside: Callable[[Array], Array]) -> _InsideFract
     xp = array_module(votes.weights)
     weight, seen = xp.zeros((2, *votes.total.shape), votes.weights.dtype)
     for region, region_weight, region_seen in vote_columns(votes):
-        here = inside(region)
-        weight += xp.where(here, region_weight, 0.0)
-        seen = xp.maximum(seen, xp.where(here, region_seen, 0.0))
+        is_inside = inside(region)
+        weight += xp.where(is_inside, region_weight, 0.0)
+        seen = xp.maximum(seen, xp.where(is_inside, region_seen, 0.0))
     known = (votes.views > 0) & (seen > 0) & xp.isfinite(seen) & xp.isfinite(weight)
     # Written out, not by `ratio`: XLA then keeps the two sums instead of gathering them anew for each use.
     return _InsideFraction(xp.where(known, xp.clip(weight / xp.where(known, seen, 1.0), 0.0, 1.0), 0.0), known)
@@ -254,9 +254,9 @@ def inside_fraction_of_regions(votes: Votes, regions: Sequence[int] | np.ndarray
 
     def add(first: int) -> None:
         voted = np.take(chosen, votes.regions[first : first + ROWS], mode="wrap")  # any further id is looked at below
-        own = first + np.unique(np.flatnonzero(voted) // places)
-        inside = _add_columns(votes_of_rows(votes, own), lambda region: np.isin(region, regions))
-        fraction[own], known[own] = inside
+        rows = first + np.unique(np.flatnonzero(voted) // places)
+        inside = _add_columns(votes_of_rows(votes, rows), lambda region: np.isin(region, regions))
+        fraction[rows], known[rows] = inside
 
     with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(add, range(0, count, ROWS)))

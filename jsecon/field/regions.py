@@ -16,7 +16,7 @@ from jsecon.numerics import array_module, inline_jit, normalize, require_labels
 from jsecon.parallel import map_over_processes
 from jsecon.types import Array, Camera, Progress, Regions
 
-ALIKE_THRESHOLD = 0.9
+DUPLICATE_COSINE = 0.9
 """Cosine of what sets two regions apart from the mean region (`mean_residuals`), from which they are one object seen
 twice, such as a track that broke. Over all pairs of simulated CLIP (medium and high noise, errors that views share) and
 of colours, all that it joins are one object. On real words (ConSE, replica_apartment_0) it joins 0.008 of the pairs, of
@@ -175,15 +175,15 @@ def choose_crops(
       most: Largest number of views, of all regions or of each.
     """
     value = np.sqrt(pixels) * (1 - cut / 2)
-    nearness = np.zeros(pixels.shape)
+    redundancy = np.zeros(pixels.shape)
     chosen = np.zeros(pixels.shape, bool)
     every = np.arange(len(pixels))
     for n in range(min(np.max(most, initial=0), pixels.shape[1])):
-        gain = np.where(chosen | (np.asarray(most)[..., None] <= n), 0.0, value * (1 - nearness / 2))
+        gain = np.where(chosen | (np.asarray(most)[..., None] <= n), 0.0, value * (1 - redundancy / 2))
         best = gain.argmax(1)
         chosen[every, best] |= gain[every, best] > 0
         cosines = np.einsum("rtj,rj->rt", directions, directions[every, best])
-        nearness = np.maximum(nearness, np.maximum(cosines, 0.0) ** 8)  # 0.5 at 23 degrees, 0.1 at 41
+        redundancy = np.maximum(redundancy, np.maximum(cosines, 0.0) ** 8)  # 0.5 at 23 degrees, 0.1 at 41
     return chosen
 
 

@@ -67,9 +67,9 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
     tree, count = np.asarray(field.tree), field.regions.count
     pixels = np.zeros((len(tree), field.regions.pixel_counts.shape[1]), np.int32)
     weighted = np.zeros((len(tree), field.regions.embeddings.shape[1]))
-    own, regions = np.asarray(field.regions.pixel_counts), np.array(field.votes.regions)
+    pixel_counts, regions = np.asarray(field.regions.pixel_counts), np.array(field.votes.regions)
     if level == PARTS:
-        pixels[:count], weighted[:count] = own, field.regions.embeddings
+        pixels[:count], weighted[:count] = pixel_counts, field.regions.embeddings
         if field.part_regions is not None:
             nodes = np.asarray(field.part_nodes)
             pixels[nodes], weighted[nodes] = field.part_regions.pixel_counts, field.part_regions.embeddings
@@ -79,8 +79,8 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
         node = np.arange(count)
         for _ in range(level):
             node = np.where(tree[node] >= 0, tree[node], node)
-        np.add.at(pixels, node, own)
-        np.add.at(weighted, node, own.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64))
+        np.add.at(pixels, node, pixel_counts)
+        np.add.at(weighted, node, pixel_counts.sum(1)[:, None] * np.asarray(field.regions.embeddings, np.float64))
         regions = np.append(node, -1)[regions]
     votes = _merge_votes(field.votes, regions.astype(np.int32), len(tree))
     return dataclasses.replace(

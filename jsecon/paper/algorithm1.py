@@ -9,7 +9,7 @@ from jaxtyping import Int16
 from scipy import sparse
 
 from jsecon.association.consensus import MIN_AREA, clean_tracks
-from jsecon.association.scene import Sparse, one_hot
+from jsecon.association.frame_superpixels import Sparse, one_hot
 from jsecon.errors import require, require_shape
 from jsecon.types import Progress
 from jsecon.vision.protocols import Segmenter, Tracker

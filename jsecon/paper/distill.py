@@ -60,13 +60,13 @@ def _distill_votes(regions: Array, weights: Array, codes: Array, reduce: str) ->
 
     def one(row):
         ids, weight = row
-        sound = jnp.all(jnp.isfinite(weight))
+        is_finite = jnp.all(jnp.isfinite(weight))
         largest = jnp.max(weight)
         weight = jnp.where((ids >= 0) & (weight > 0), weight / jnp.where(largest > 0, largest, 1.0), 0.0)
         ids = jnp.clip(ids, 0, codes.shape[0] - 1)
         code = _REDUCTIONS[reduce](units[ids], weight)
         with_code = 2 * jnp.sum(jnp.where(known[ids], weight, 0.0)) > jnp.sum(weight)
-        return jnp.where(sound & with_code, normalize(code), 0.0)
+        return jnp.where(is_finite & with_code, normalize(code), 0.0)
 
     return jax.lax.map(one, (regions, weights), batch_size=_ROWS)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16, UInt8
 
-from jsecon.association.scene import (
+from jsecon.association.frame_superpixels import (
     FrameSuperpixels,
     SceneSuperpixels,
     assign_superpixels,
@@ -65,16 +65,16 @@ class GeometricTracker:
         order = self._outward(index)
         for t in order * 2:  # once outward, and once with the evidence of all other frames
             view = views[t]
-            here = evidence[view.seen]
+            view_evidence = evidence[view.seen]
             if t in owners:
                 rows, columns, weight = _evidence(view, owners[t], len(classes))
-                here[rows, columns] -= weight
-            if not (here[:, : len(prompts)] > 1e-3).any():  # no prompt is visible
+                view_evidence[rows, columns] -= weight
+            if not (view_evidence[:, : len(prompts)] > 1e-3).any():  # no prompt is visible
                 continue
-            owners[t] = self._match(view, here, best[view.seen])
+            owners[t] = self._match(view, view_evidence, best[view.seen])
             rows, columns, weight = _evidence(view, owners[t], len(classes))
-            here[rows, columns] += weight
-            evidence[view.seen] = here
+            view_evidence[rows, columns] += weight
+            evidence[view.seen] = view_evidence
             best[view.seen] = np.maximum(best[view.seen], view.clarity)
         for t, owner in owners.items():
             labels[t] = np.where(owner < len(prompts), owner, -1).astype(np.int16)[views[t].labels]

@@ -82,7 +82,7 @@ def prepare(folder: Path) -> None:
             partial.unlink(missing_ok=True)
 
 
-def fetch(
+def read_or_compute(
     path: Path, compute: Callable[[], Any], *, note: Callable[[str], None] = lambda text: None
 ) -> tuple[Any, float, bool]:
     """Reads the result of a stage, or computes and stores it.

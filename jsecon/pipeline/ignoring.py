@@ -31,13 +31,13 @@ def ignore_named(capture: Capture, texts: list[str], models: Models, folder: Pat
     for t, (name, file) in enumerate(zip(capture.names, capture.files)):
         frame = np.asarray(capture.frames[t])
         masks = segmenter(frame, t)
-        own = masks[_is_named(embedder.embed_regions(frame, masks), named, words)].any(axis=0)
-        found += bool(own.any())
-        ignored[t] |= own
+        pixels = masks[_is_named(embedder.embed_regions(frame, masks), named, words)].any(axis=0)
+        found += bool(pixels.any())
+        ignored[t] |= pixels
         size = frame.shape[1::-1] if file.view is not None else (file.width, file.height)
         path = folder / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, cv2.resize(np.where(own, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
+        write_image(path, cv2.resize(np.where(pixels, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
         progress(t + 1, len(capture.names))
     note = f"{', '.join(texts)}: found and ignored in {found} of {len(ignored)} frames; the masks are in {folder}."
     return dataclasses.replace(capture, ignored=ignored, notes=(*capture.notes, note))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy import sparse
 
-from jsecon.association.scene import FrameSuperpixels, frame_superpixels, label_by_regions
+from jsecon.association.frame_superpixels import FrameSuperpixels, frame_superpixels, label_by_regions
 from jsecon.errors import InputError, join_first
 from jsecon.field.columns import votes_of_rows
 from jsecon.field.evidence import IGNORED, pack_evidence, plan_evidence
@@ -182,8 +182,8 @@ def make_views(
         count = old + new
         evidence = list_labels(labels, count)
         if new:  # the next frame may show them too
-            own = evidence.matrix(len(owner), count)
-            opened.append(own[:, old:count].multiply(1 / np.maximum(own.sum(1), 1e-9)).tocsr())
+            view_weights = evidence.matrix(len(owner), count)
+            opened.append(view_weights[:, old:count].multiply(1 / np.maximum(view_weights.sum(1), 1e-9)).tocsr())
         shown, areas = np.unique(labels[labels >= 0], return_counts=True)
         rows = np.asarray(embedder.embed_regions(pixels, labels[None] == shown[:, None, None]), np.float32)
         pixel_counts = np.stack([shown, areas]).astype(np.int32)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsecon.association.consensus import Objects, track_masks
-from jsecon.association.scene import SceneSuperpixels
+from jsecon.association.frame_superpixels import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
 from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence
@@ -39,7 +39,7 @@ from jsecon.process import VIEWS_AT_ONCE, cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.masks.masks import load_labels, load_proposals
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
-from jsecon.views.plan import LEAST_GAIN, frames_by_need
+from jsecon.views.placing import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import ClassicalSegmenter
 from jsecon.vision.protocols import Segmenter
 from jsecon.vision.surfaces import surfaces_from_depth
@@ -64,26 +64,26 @@ def _plan_labels(context: RunContext) -> Stage:
         raise InputError("--vision-minutes", problem, remedy="Leave it out, or name a --segmenter.")
     if folder is not None:
         key_options |= context.key_options("level")
-        how, read = f"read from {folder.name}", _read_masks
-        return Stage("objects", how, read, after=("load",), key_options=key_options, files=(folder,))
+        task, read = f"read from {folder.name}", _read_masks
+        return Stage("objects", task, read, after=("load",), key_options=key_options, files=(folder,))
     if options.proposals is not None:
-        how = f"proposals read from {options.proposals.name}"
+        task = f"proposals read from {options.proposals.name}"
         key_options |= context.key_options("level")
     elif models.segmenter is not None:
-        how = f"proposals of level {options.level} by {_model_name(options.segmenter or '', 'segmenter')}"
+        task = f"proposals of level {options.level} by {_model_name(options.segmenter or '', 'segmenter')}"
         key_options["model"] = models.segmenter.name
     else:
-        how = "proposals by colour and texture"
+        task = "proposals by colour and texture"
     if options.tracker is None:
-        how += ", what the views agree on"
+        task += ", what the views agree on"
         key_options |= context.key_options("seed", "centre_pixel_weight")
     elif options.tracker == GEOMETRIC:
-        how += ", followed through the Gaussians"
+        task += ", followed through the Gaussians"
     else:
-        how += f", followed by {_model_name(options.tracker, 'tracker')}"
+        task += f", followed by {_model_name(options.tracker, 'tracker')}"
     key_options["tracker"] = options.tracker if models.tracker is None else models.tracker.name
     after, files = ("load", "gaussians"), (options.proposals,)
-    return Stage("objects", how, _find_objects, after, key_options, files, distributed=options.tracker is None)
+    return Stage("objects", task, _find_objects, after, key_options, files, distributed=options.tracker is None)
 
 
 def _model_name(folder: str | Path, role: Role) -> str:
@@ -97,25 +97,25 @@ def _model_name(folder: str | Path, role: Role) -> str:
 def _plan_regions(context: RunContext) -> list[Stage]:
     """Plans an embedding of each region, and of each part that the tree of objects has."""
     options, embedder, after = context.options, context.models.embedder.name, ("load", "objects")
-    how = f"embedded by {embedder!r} in {options.crops} views each, or more where these scatter, weighted by pixels"
+    task = f"embedded by {embedder!r} in {options.crops} views each, or more where these scatter, weighted by pixels"
     key_options = {"embedder": embedder} | context.key_options("crops")
-    stages = [Stage("regions", how, _embed_objects, after=after, key_options=key_options, distributed=True)]
+    stages = [Stage("regions", task, _embed_objects, after=after, key_options=key_options, distributed=True)]
     if options.masks is None and options.tracker is None:
-        how, after = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each", (*after, "regions")
-        stages.append(Stage("parts", how, _embed_parts, after=after, key_options=key_options, distributed=True))
+        task, after = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each", (*after, "regions")
+        stages.append(Stage("parts", task, _embed_parts, after=after, key_options=key_options, distributed=True))
     return stages
 
 
 def _plan_lifting(context: RunContext) -> list[Stage]:
     """Plans the votes of the regions for each Gaussian, and the codes of the paper if the options ask for them."""
-    how, after = "the strongest regions of each Gaussian", ("load", "gaussians", "objects")
+    task, after = "the strongest regions of each Gaussian", ("load", "gaussians", "objects")
     key_options = context.key_options("centre_pixel_weight", "ledger")
-    votes = Stage("votes", how, _accumulate_votes, after=after, key_options=key_options, distributed=True)
+    votes = Stage("votes", task, _accumulate_votes, after=after, key_options=key_options, distributed=True)
     if not context.options.paper:
         return [votes]
-    how = "3 numbers per region by an autoencoder, distilled into the Gaussians by their votes"
+    task = "3 numbers per region by an autoencoder, distilled into the Gaussians by their votes"
     key_options = context.key_options("seed")
-    return [votes, Stage("codes", how, _compute_codes, after=("regions", "votes"), key_options=key_options)]
+    return [votes, Stage("codes", task, _compute_codes, after=("regions", "votes"), key_options=key_options)]
 
 
 def _chooses_frames(context: RunContext) -> bool:
@@ -265,8 +265,8 @@ def _embed_objects(stage: StageInput) -> StageResult:
     geometry = crop_geometry(labels, view.cameras, int(labels.max()) + 1)
 
     def embed(views):
-        how = {"views": views, "progress": stage.progress}
-        return region_embeddings(view.frames, labels, context.models.embedder.embed_regions, **how)
+        kwargs = {"views": views, "progress": stage.progress}
+        return region_embeddings(view.frames, labels, context.models.embedder.embed_regions, **kwargs)
 
     chosen = choose_crops(*geometry, context.options.crops)
     embedded = embed(chosen)

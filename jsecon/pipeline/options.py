@@ -54,7 +54,7 @@ class Range:
         """The range in words."""
         if self.direction:
             return "a direction, three numbers that are not all 0"
-        return f"{'above' if self.above else 'at least'} {self.low:g} and at most {self.high:g}"
+        return f"{'above' if self.above else 'at least'} {self.low:.10g} and at most {self.high:.10g}"
 
 
 def _leaves(tree: Any) -> Iterator[Any]:

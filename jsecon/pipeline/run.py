@@ -28,8 +28,8 @@ from jsecon.pipeline.model_loading import open_models
 from jsecon.pipeline.objects import plan_objects
 from jsecon.pipeline.options import Options, check_ranges, is_bare_scene, read_date, require_writable
 from jsecon.pipeline.progress import Console, Step
-from jsecon.pipeline.scene import plan_scene
 from jsecon.pipeline.scene_files import read_scene
+from jsecon.pipeline.scene_stages import plan_scene
 from jsecon.pipeline.sources import provenance
 from jsecon.pipeline.stages import (
     WARNING,
@@ -47,7 +47,7 @@ from jsecon.read.captures.capture import read_posed_images
 from jsecon.read.captures.frames import FrameOptions, evenly_spaced
 from jsecon.read.captures.images import encode_jpeg
 from jsecon.read.masks.masks import load_proposals
-from jsecon.read.splats.points import load_point_cloud
+from jsecon.read.splats.point_clouds import load_point_cloud
 from jsecon.types import Capture, Gaussians, LanguageField, Quality, Regions
 from jsecon.views.frame import field_up
 from jsecon.vision.classical import require_contrib
@@ -118,7 +118,7 @@ def _plan(context: RunContext, stage_list: list[Stage]) -> _RunState:
     for stage in stage_list:
         keys[stage.name] = stage.key(keys, context.out)
     paths = {name: context.out / "cache" / f"{name}-{key}.safetensors" for name, key in keys.items()}
-    steps = [Step(stage.name, "cached" if paths[stage.name].exists() else "run", stage.how) for stage in stage_list]
+    steps = [Step(stage.name, "cached" if paths[stage.name].exists() else "run", stage.task) for stage in stage_list]
     return _RunState(keys, paths, steps)
 
 
@@ -208,7 +208,7 @@ def _compute_stage(context: RunContext, stage: Stage, state: _RunState, console:
         return result
 
     with console.progress(stage.name) as progress:
-        result, seconds, fresh = cache.fetch(path, functools.partial(compute, progress), note=console.note)
+        result, seconds, fresh = cache.read_or_compute(path, functools.partial(compute, progress), note=console.note)
     setattr(state.results, stage.name, result.value)
     state.seconds[stage.name] = seconds
     checkpoint.remove()

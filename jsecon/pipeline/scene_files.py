@@ -21,7 +21,7 @@ from jsecon.fit.quality import QUICK_LONG_SIDE
 from jsecon.fit.resize import resize_frame, shrink_cameras
 from jsecon.pipeline.stages import WARNING
 from jsecon.read.captures.frames import evenly_spaced, transform_poses
-from jsecon.read.splats.files import read_gaussians
+from jsecon.read.splats.formats import read_gaussians
 from jsecon.splat.render import render_rgb
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Capture, Gaussians, Progress
@@ -196,9 +196,9 @@ def _training_worlds(
     middle = np.median(places - (ahead * places).sum(1, keepdims=True) * ahead, axis=0)
     plain = _similarity(turn, middle, np.median(np.linalg.norm(places - middle, axis=1)))
     if len(points) > 3:
-        there = points @ plain[:3, :3].T + plain[:3, 3]
-        centre = np.median(there, axis=0)
-        axes = np.linalg.eigh(np.cov(there - centre, rowvar=False))[1][:, ::-1].T
+        moved = points @ plain[:3, :3].T + plain[:3, 3]
+        centre = np.median(moved, axis=0)
+        axes = np.linalg.eigh(np.cov(moved - centre, rowvar=False))[1][:, ::-1].T
         axes[0] *= np.sign(np.linalg.det(axes))
         for signs in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
             turn = np.diag(signs) @ axes

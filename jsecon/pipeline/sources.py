@@ -19,7 +19,7 @@ from jsecon.files import parse_json
 from jsecon.networks.hub import cached_address
 from jsecon.pipeline.options import Options, is_bare_scene
 from jsecon.read.captures.capture import taken_on
-from jsecon.read.splats.points import read_crs
+from jsecon.read.splats.point_clouds import read_crs
 from jsecon.types import LanguageField
 
 
@@ -80,8 +80,8 @@ def _given_points(options: Options) -> Path | None:
 
 def _relative_folders(options: Options, out: Path) -> dict[str, str]:
     """Folders of options, relative to the output folder."""
-    given = {"embedder": options.embedder, "points": _given_points(options)}
-    paths = {name: Path(path) for name, path in given.items() if path is not None}
+    inputs = {"embedder": options.embedder, "points": _given_points(options)}
+    paths = {name: Path(path) for name, path in inputs.items() if path is not None}
     return {name: hint for name, path in paths.items() if cached_address(path) is None and (hint := _hint(path, out))}
 
 

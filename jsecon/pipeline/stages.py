@@ -157,7 +157,7 @@ class Stage:
 
     name: str
     """Name of the stage, and of its result in `Results`."""
-    how: str
+    task: str
     """What it will do, for the plan that a run prints first."""
     compute: Callable[[StageInput], StageResult]
     """Computes the result."""

@@ -180,8 +180,8 @@ def _planes(depth: Float[np.ndarray, "h w"], camera: Camera) -> Float[np.ndarray
     c = m_d - a * m_u - b * m_v
     fx, fy, cx, cy = (float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     planes = np.stack([a * fx, b * fy, a * (cx - 0.5) + b * (cy - 0.5) + c], axis=-1)
-    here = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
-    is_plane &= (residual <= (0.02 * m_d) ** 2) & (here > 0.5 * m_d)
+    plane_depth = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
+    is_plane &= (residual <= (0.02 * m_d) ** 2) & (plane_depth > 0.5 * m_d)
     return np.where(is_plane[..., None], planes, 0)
 
 

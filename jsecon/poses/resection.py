@@ -101,8 +101,8 @@ def _find_pose(landmarks: _Landmarks, photo: UInt8[np.ndarray, "h w 3"]) -> tupl
             if done and len(inliers) > count:
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(motion[0])[0], motion[1].ravel()
-                own = inliers.ravel().astype(int)
-                count, best = len(own), (pose, zoom, rays[own], places[own])
+                inlier_ids = inliers.ravel().astype(int)
+                count, best = len(inlier_ids), (pose, zoom, rays[inlier_ids], places[inlier_ids])
         if count >= 3 * MIN_INLIERS:
             break
     if best is None or count < MIN_INLIERS:
@@ -170,10 +170,10 @@ def _flow_matches(
     image = (np.clip(np.asarray(render_rgb(gaussians, camera).features), 0, 1) * 255).astype(np.uint8)
     rendered, real = (cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (image, photo))
     flow = cast(Any, cv2).DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    there, back = flow.calc(rendered, real, None), flow.calc(real, rendered, None)
+    forward, back = flow.calc(rendered, real, None), flow.calc(real, rendered, None)
     y, x = (axis.ravel() for axis in np.mgrid[2 : photo.shape[0] - 2 : 4, 2 : photo.shape[1] - 2 : 4])
     start = np.stack([x, y], 1).astype(np.float32)
-    end = start + there[y, x]
+    end = start + forward[y, x]
     returned = cv2.remap(back, end[:, :1], end[:, 1:], cv2.INTER_LINEAR)[:, 0]
     structure = cv2.cornerMinEigenVal(rendered, 7)[y, x]
     begun, ended = (
@@ -181,5 +181,5 @@ def _flow_matches(
     )
     places, known = _places(gaussians, camera, begun)
     inside = ((end >= 0) & (end < [photo.shape[1], photo.shape[0]])).all(1) & (structure > np.median(structure))
-    kept = known & inside & (np.linalg.norm(there[y, x] + returned, axis=1) < 1)
+    kept = known & inside & (np.linalg.norm(forward[y, x] + returned, axis=1) < 1)
     return ended[kept], places[kept]

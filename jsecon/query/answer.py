@@ -152,11 +152,11 @@ def _match(embeddings, pixels, overlap, queries, excluded, words, rules: QueryRu
     best = xp.argmax(xp.where(chosen, similarity + 4.0 * is_best, -xp.inf))
     matches = chosen.any()
 
-    def of_best(rows):
+    def at_best(rows):
         return xp.take_along_axis(rows, scores.best[:, None], axis=1)[:, 0]
 
-    known = of_best(scores.known)
-    nearest = xp.where(known.any(), xp.where(known, of_best(scores.similarity), -xp.inf).max(), 0.0)
+    known = at_best(scores.known)
+    nearest = xp.where(known.any(), xp.where(known, at_best(scores.similarity), -xp.inf).max(), 0.0)
     ranked = known & ~xp.isnan(scores.rank)
     return RegionMatch(
         xp.asarray(chosen),

@@ -82,17 +82,17 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
     table = _standardised(plain, known, pixels) if standardise else plain
     best = jnp.argmax(jnp.where(valid, table, -jnp.inf), axis=1)
 
-    def of_best(table):
+    def at_best(table):
         return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
 
-    standing = None
+    rank_and_margin = None
     word_scores = compare_words(embeddings, words, rules.retrieval)
     if word_scores is not None:
         scores = word_scores.similarity
         count = jnp.sum(jnp.isfinite(scores), axis=0)
-        below = jnp.sum(scores < of_best(plain), axis=0, dtype=plain.dtype)
-        standing = (jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0), None)
-    accepted = (rules.judge(standing, of_best(plain)) > ABSENT) & known & jnp.any(valid)
+        below = jnp.sum(scores < at_best(plain), axis=0, dtype=plain.dtype)
+        rank_and_margin = (jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0), None)
+    accepted = (rules.judge(rank_and_margin, at_best(plain)) > ABSENT) & known & jnp.any(valid)
     count = votes.regions.shape[0]
 
     def sums(allowed):
@@ -124,5 +124,5 @@ def _standardised(table: Array, known: Array, pixels: Array) -> Array:
     weight = weight / jnp.maximum(jnp.sum(weight), jnp.finfo(table.dtype).tiny)
     apart = jnp.where(known[:, None], table - jnp.sum(weight * table, axis=0), 0.0)
     deviation = jnp.sqrt(jnp.sum(weight * apart**2, axis=0))
-    wide = deviation > 8 * jnp.finfo(table.dtype).eps
-    return jnp.where(wide, apart / jnp.where(wide, deviation, 1.0), 0.0)
+    varies = deviation > 8 * jnp.finfo(table.dtype).eps
+    return jnp.where(varies, apart / jnp.where(varies, deviation, 1.0), 0.0)

@@ -270,9 +270,9 @@ def parse_expression(text: str) -> _Expression:
     tokens = _tokens(text)
     if not tokens:
         raise InputError("expression", "the text is empty", remedy=_REMEDY)
-    if asked := _asks_for_property(text):
+    if words := _asks_for_property(text):
         remedy = "Ask for the thing alone, or put words that are its name in quotes; the catalogue has names and sizes."
-        raise InputError(where, f"{asked!r} asks for a property of a thing, and a text selects things", remedy=remedy)
+        raise InputError(where, f"{words!r} asks for a property of a thing, and a text selects things", remedy=remedy)
     if len(tokens) > MAX_WORDS:
         problem = f"the text has {len(tokens)} words, and an expression at most {MAX_WORDS}"
         raise InputError("expression", problem, remedy="Ask for one object and its relations to others.")
@@ -368,11 +368,11 @@ def _question(tokens: list[_Token]) -> tuple[bool, list[_Token]]:
         if words in ("how many", "what", "who", "which"):
             while len(rest) > 1 and rest[0].key in _WORDS["fillers"]:
                 rest = rest[1:]
-        asked = words.split()[0].removesuffix("'s")
+        word = words.split()[0].removesuffix("'s")
         spelled = _longest(_after_adverbs(rest), 0, _SPELLED)
-        if asked in ("what", "who", "how", "which") and spelled and (len(spelled) > 1 or spelled in _RELATION_OF):
-            asked = "people" if asked == "who" else "things"
-            return True, [_Token(asked, asked), *rest]
+        if word in ("what", "who", "how", "which") and spelled and (len(spelled) > 1 or spelled in _RELATION_OF):
+            word = "people" if word == "who" else "things"
+            return True, [_Token(word, word), *rest]
         if words in ("what", "who") and rest[0].key not in _WORDS["anything"]:
             continue
         if words in ("is", "are") and rest[0].key not in (*_WORDS["determiners"], *_WORDS["anything"]):
@@ -381,14 +381,14 @@ def _question(tokens: list[_Token]) -> tuple[bool, list[_Token]]:
             continue  # a "what is love" poster
         if words in ("count", "show", "list", "locate") and rest[0].key not in _QUANTIFIERS and not _is_plural(rest):
             continue  # a count down timer, a show case
-        return asked in ("how", "count", "is", "are") or words in ("what", "who", "list"), rest
+        return word in ("how", "count", "is", "are") or words in ("what", "who", "list"), rest
     return False, tokens
 
 
 def _asks_for_property(text: str) -> str:
     """Returns the words of a question for more than which things there are, such as "what colour is", or ""."""
-    asked = _ABOUT_PROPERTY.match(" ".join(token.key for token in _tokens(text)))
-    return asked[0] if asked else ""
+    question = _ABOUT_PROPERTY.match(" ".join(token.key for token in _tokens(text)))
+    return question[0] if question else ""
 
 
 def _number(key: str) -> int | None:

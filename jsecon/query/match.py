@@ -115,14 +115,14 @@ def score_text(
     if rules.retrieval != "cosine" and words is not None:  # the plain cosine is the paper's, without weights
         weighted = xp.where(similarity > 0, similarity * weight, similarity)
     best = xp.argmax(xp.where(known, weighted, -xp.inf))
-    standing = None
+    rank_and_margin = None
     rank = xp.asarray(xp.nan, similarity.dtype)
     if words is not None:
         weight = xp.where(known, weight, 0.0)
         reach = xp.max(xp.where(known, similarity, -xp.inf)), _height(similarity, weight)
-        standing = _standing_among_words(reach, text, words, weight)
-        rank = standing[0]
-    state = rules.judge(standing, similarity[best])
+        rank_and_margin = _rank_and_margin(reach, text, words, weight)
+        rank = rank_and_margin[0]
+    state = rules.judge(rank_and_margin, similarity[best])
     return _TextScores(similarity, known, best, state, rank)
 
 
@@ -147,7 +147,7 @@ def _text_direction(text: Float[Array, " e"], mean: Float[Array, " e"] | None, r
     return normalize(text) if retrieval == "cosine" or mean is None else normalize(text) - mean
 
 
-def _standing_among_words(
+def _rank_and_margin(
     reach: tuple[Number, Number],
     text: Float[Array, " e"],
     words: _WordScores,

@@ -89,8 +89,8 @@ def object_shapes(
     order = np.argsort(labels, kind="stable")[np.sum(labels < 0) :]
     shapes = []
     for rows in np.split(order, np.cumsum(count)[:-1]) if len(count) else ():
-        own = np.zeros((len(rows), 3, 3)) if spreads is None else np.asarray(spreads, np.float64)[rows]
-        shapes.append(_measure(means[rows], own, turns))
+        covariances = np.zeros((len(rows), 3, 3)) if spreads is None else np.asarray(spreads, np.float64)[rows]
+        shapes.append(_measure(means[rows], covariances, turns))
     sizes = ((3,), (3, 3), (3,), (3,), (3,), (_POINTS, 3))
     columns = [np.stack(column) for column in zip(*shapes)] if shapes else [np.zeros((0, *size)) for size in sizes]
     center, axes, half_size, low, high, spaced = columns

@@ -34,17 +34,17 @@ def match_parts(
       Nodes of the tree, and an index of `rules.STATES`: ABSENT if there are none.
     """
     wholes = range(field.regions.count) if wholes is None else wholes
-    own = np.flatnonzero(np.isin(part_objects(field), list(wholes)))
-    if field.part_regions is None or not len(own):
+    parts = np.flatnonzero(np.isin(part_objects(field), list(wholes)))
+    if field.part_regions is None or not len(parts):
         return np.zeros(0, int), ABSENT
-    rows, whole = np.asarray(field.part_regions.embeddings)[own], np.asarray(field.regions.embeddings)[list(wholes)]
-    pixels = np.asarray(field.part_regions.pixel_counts)[own], np.asarray(field.regions.pixel_counts)[list(wholes)]
+    rows, whole = np.asarray(field.part_regions.embeddings)[parts], np.asarray(field.regions.embeddings)[list(wholes)]
+    pixels = np.asarray(field.part_regions.pixel_counts)[parts], np.asarray(field.regions.pixel_counts)[list(wholes)]
     regions = Regions(np.concatenate([rows, whole]), np.concatenate(pixels))
     votes = dataclasses.replace(field.votes, overlap=None)
     match = match_regions(dataclasses.replace(field, regions=regions, votes=votes), texts, rules)
-    if not 0 <= int(match.region) < len(own) or int(match.state) < FOUND:
+    if not 0 <= int(match.region) < len(parts) or int(match.state) < FOUND:
         return np.zeros(0, int), ABSENT
-    nodes = np.asarray(field.part_nodes)[own[np.asarray(match.chosen)[: len(own)]]]
+    nodes = np.asarray(field.part_nodes)[parts[np.asarray(match.chosen)[: len(parts)]]]
     if unless >= 0:
         tree, leaf = np.asarray(field.tree), np.asarray(field.leaf)
         inside = leaf[node_members(tree, leaf, unless)]

@@ -64,7 +64,7 @@ def _stack_shapes(objects: Sequence[Object]) -> ObjectShapes:
     return jax.tree.map(lambda *columns: np.concatenate(columns), *(found.shape for found in objects))
 
 
-def evaluate(
+def find_referents(
     find: Find,
     thing: NounPhrase,
     conditions: Sequence[Condition],
@@ -85,7 +85,7 @@ def evaluate(
         anchors = []
         for anchor in condition.anchors:
             nested = condition.conditions if anchor is condition.anchors[-1] else ()
-            result = evaluate(find, anchor, nested, view, units)
+            result = find_referents(find, anchor, nested, view, units)
             if not result.chosen:
                 return _ReferringResult([], used=used, reason=f"nothing to compare with: {result.reason}")
             anchors.append(result.chosen)
@@ -133,7 +133,7 @@ def with_everything(relation: str, chosen: Sequence[Object], things: Sequence[Ob
 
 def _apart(a: Sequence[Object], b: Sequence[Object]) -> Bool[np.ndarray, "k l"]:
     """Which pairs of objects have no region in common."""
-    return np.array([[not set(one.regions) & set(other.regions) for other in b] for one in a])
+    return np.array([[not set(first.regions) & set(other.regions) for other in b] for first in a])
 
 
 def _condition_scores(

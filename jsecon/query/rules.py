@@ -6,7 +6,7 @@ import jax
 
 from jsecon.errors import require_one_of
 from jsecon.field.membership import SHARE_THRESHOLD
-from jsecon.field.regions import ALIKE_THRESHOLD
+from jsecon.field.regions import DUPLICATE_COSINE
 from jsecon.field.similarity import Number
 from jsecon.numerics import array_module
 from jsecon.types import static
@@ -38,7 +38,7 @@ class QueryRules:
     no text. None judges by the margin among these words."""
     min_score: Number | None = None
     """Smallest similarity of the best region, in place of a comparison with words."""
-    duplicate_cosine: Number | None = ALIKE_THRESHOLD
+    duplicate_cosine: Number | None = DUPLICATE_COSINE
     """Cosine from which two regions are one object seen twice, and both answer; None disables it."""
     fragment_score: Number | None = 0.5
     """Relative score, 0 at the median region and 1 at the best, from which a region that overlaps the best is a
@@ -57,15 +57,15 @@ class QueryRules:
         """Raises ValueError for an unknown retrieval."""
         require_one_of("QueryRules", self.retrieval, RETRIEVALS, f"{RETRIEVALS[0]!r} is the default.")
 
-    def judge(self, standing, similarity):
+    def judge(self, rank_and_margin, similarity):
         """Decides whether the scene has what a text names: the one judgement of texts and of regions.
 
-        `standing` is the text's rank and margin among unrelated words (query/match.py), None without such words; the
-        margin is None where a region is compared with a list of classes. Returns an index of STATES.
+        `rank_and_margin` are the text's among unrelated words (query/match.py), None without such words; the margin is
+        None where a region is compared with a list of classes. Returns an index of STATES.
         """
-        if self.min_score is not None or standing is None:
+        if self.min_score is not None or rank_and_margin is None:
             return FOUND * (similarity >= (MIN_COSINE if self.min_score is None else self.min_score))
-        rank, margin = standing
+        rank, margin = rank_and_margin
         if margin is None:
             return FOUND * (rank >= (MIN_RANK if self.min_rank is None else self.min_rank))
         state = UNSURE * (margin >= MIN_MARGIN) + (FOUND - UNSURE) * (margin >= FOUND_MARGIN)

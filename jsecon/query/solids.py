@@ -49,7 +49,7 @@ class _Solid(NamedTuple):
     """Middle of the primitive."""
 
 
-def surface_points(
+def object_surfaces(
     gaussians: Gaussians, cameras: Camera, labels: Int[np.ndarray, " n"]
 ) -> list[Float[np.ndarray, "s 3"]]:
     """Finds what T views show of the surfaces of objects, labelled 0 .. K-1 or -1: a point of each pixel, world.
@@ -59,16 +59,16 @@ def surface_points(
     whole = gaussians.count <= MAX_WHOLE
 
     def view(t: int) -> list[tuple[int, np.ndarray]]:
-        camera, own, part = jax.tree.map(np.asarray, cameras[t]), labels, gaussians
+        camera, part_labels, part = jax.tree.map(np.asarray, cameras[t]), labels, gaussians
         if not whole:
             rows, part = visible_part(gaussians, camera)
-            own = np.pad(labels[rows], (0, part.count - len(rows)), constant_values=-1)
+            part_labels = np.pad(labels[rows], (0, part.count - len(rows)), constant_values=-1)
         plan, pose, found = plan_view(part, camera), np.asarray(camera.world_to_camera), []
         z = np.asarray(part.means) @ pose[2, :3] + pose[2, 3]
-        objects = np.unique(own[own >= 0])
+        objects = np.unique(part_labels[part_labels >= 0])
         for first in range(0, len(objects), _OBJECTS):
             some = objects[first : first + _OBJECTS]
-            is_own = own[:, None] == np.pad(some, (0, _OBJECTS - len(some)), constant_values=-2)
+            is_own = part_labels[:, None] == np.pad(some, (0, _OBJECTS - len(some)), constant_values=-2)
             features = np.concatenate([is_own, is_own * z[:, None]], axis=1).astype(np.float32)
             image = np.asarray(render_plan(plan, jnp.asarray(features)).features)
             for n, number in enumerate(some.tolist()):

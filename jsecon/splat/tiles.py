@@ -94,9 +94,9 @@ def _sorted_pairs(blocks: Array, owner: Array, depths: Array, number: int) -> tu
         return blocks, owner
     bits = lax.bitcast_convert_type(depths, jnp.uint32)[owner]
     with jax.enable_x64(True):
-        wide = [lax.convert_element_type(values, jnp.uint64) for values in (blocks, bits, owner)]
-        key = wide[0]
-        for values, size in zip(wide[1:], (31, for_index)):
+        words = [lax.convert_element_type(values, jnp.uint64) for values in (blocks, bits, owner)]
+        key = words[0]
+        for values, size in zip(words[1:], (31, for_index)):
             key = lax.shift_left(key, lax.full_like(key, size)) | values
         key = lax.sort(key, is_stable=False)
         owner = lax.convert_element_type(key & lax.full_like(key, (1 << for_index) - 1), jnp.int32)
@@ -136,8 +136,8 @@ def tile_lists(
     ends = jnp.cumsum(areas, dtype=jnp.int32)
     if len(areas) * number >= 2**31:
         with jax.enable_x64(True):
-            wide = lax.cumsum(lax.convert_element_type(areas, jnp.int64))
-            ends = lax.convert_element_type(lax.min(wide, lax.full_like(wide, 2**31 - 1)), jnp.int32)
+            area_sums = lax.cumsum(lax.convert_element_type(areas, jnp.int64))
+            ends = lax.convert_element_type(lax.min(area_sums, lax.full_like(area_sums, 2**31 - 1)), jnp.int32)
     starts, total = ends - areas, jnp.minimum(ends[-1], capacity)
     marks = jnp.zeros(room + 1, jnp.int32).at[jnp.minimum(starts, room)].add(1, mode="promise_in_bounds")
     boxes = jnp.stack([starts, x0, y0, jnp.maximum(x1 - x0, 1)], axis=-1)

@@ -42,7 +42,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Array, "4 4"]) -
         log_scales=log_scales + np.asarray(np.log(scale), log_scales.dtype),
         quaternions=turns @ turn.astype(turns.dtype),
         opacity_logits=gaussians.opacity_logits,
-        sh=_sh_rotation(rotation, sh.shape[1]).astype(sh.dtype) @ sh,
+        sh=None if sh is None else _sh_rotation(rotation, sh.shape[1]).astype(sh.dtype) @ sh,
     )
 
 

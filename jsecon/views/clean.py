@@ -135,9 +135,9 @@ def _view(
     regions = int(bins.max(initial=-1)) + 1
     found = view_evidence(gaussians, camera, bins, regions, capacity=capacity)
     rows, pose = found.gaussians, np.asarray(camera.world_to_camera, np.float32)
-    own = np.repeat(np.arange(len(rows)), np.diff(found.starts))
+    owner = np.repeat(np.arange(len(rows)), np.diff(found.starts))
     middles = np.append(nearest * (1 + _STEP) ** (np.arange(regions) + 0.5), 0)  # the last is that of no surface
     z = np.asarray(gaussians.means, np.float32)[rows] @ pose[2, :3] + pose[2, 3]
     weights = np.where(found.regions < regions, found.weights, 0)
-    front = np.bincount(own, weights * (middles[found.regions] > (1 + gap) * z[own]), len(rows))
-    return rows, front, np.bincount(own, weights, len(rows)), found.max_pixel_weights
+    front = np.bincount(owner, weights * (middles[found.regions] > (1 + gap) * z[owner]), len(rows))
+    return rows, front, np.bincount(owner, weights, len(rows)), found.max_pixel_weights

@@ -144,9 +144,9 @@ def _judge(
     level = [plane for plane in planes if abs(plane.normal @ up) > _LEVEL]
     places = [float(np.sign(plane.normal @ up) * plane.offset) for plane in level]
     covered = [_footprint(plane.points, up) / whole for plane in level]
-    wide = [place for place, share in zip(places, covered) if share >= 0.5]  # floors and ceilings
-    has_ceiling = any(place >= high - 3 * tolerance for place in wide)
-    has_floor = any(place <= low + 3 * tolerance for place in wide)
+    large = [place for place, share in zip(places, covered) if share >= 0.5]  # floors and ceilings
+    has_ceiling = any(place >= high - 3 * tolerance for place in large)
+    has_floor = any(place <= low + 3 * tolerance for place in large)
     on_ground = any(abs(place - low) <= 2 * tolerance for place in places)
     trees = [KDTree(plane.points) for plane in level]
     rests, weights, feet = [], [], 0

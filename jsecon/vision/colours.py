@@ -87,7 +87,7 @@ class ColourEmbedder:
     def unrelated_words(self) -> Float32[np.ndarray, "w e"]:
         """Embeddings of unrelated texts. A field holds its own."""
         basic = [name for name in self.names if name.split()[-1] in BASIC]
-        return self.embed_text([f"{one} and {other}" for one, other in itertools.combinations(basic, 2)])
+        return self.embed_text([f"{first} and {other}" for first, other in itertools.combinations(basic, 2)])
 
     def embed_regions(
         self, frame: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "m _ _"]

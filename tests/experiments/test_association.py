@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from experiments.rivals.evidence import Evidence, unit
+from experiments.baselines.evidence import Evidence, unit
 from experiments.tables.association import ROWS, associated, overlaps
 from jsecon.types import Camera
 

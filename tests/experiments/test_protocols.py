@@ -9,9 +9,9 @@ from balls import ring_of_balls
 from hypothesis import given, settings, strategies as st
 from small_field import unit_rows
 
+from experiments.baselines.leaves import silhouette_overlaps
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text, without_stragglers
 from experiments.protocols.points import evaluate_points, point_class_means
-from experiments.rivals.leaves import silhouette_overlaps
 from jsecon import InputError, plan_view, selection_mask
 
 

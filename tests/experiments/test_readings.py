@@ -5,7 +5,7 @@ import pytest
 from experiments.test_tables import folder, small, with_gaussians  # noqa: F401
 
 from experiments import fair, lerf, shared_errors
-from experiments.rivals.lifting import smoothed
+from experiments.baselines.lifting import smoothed
 from experiments.tables.readings import as_share
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from experiments.protocols.rendered import VALA_THRESHOLD
 from experiments.tables.silhouette import SWEEPS, WEIGHTS, Footprints, ascend
-from jsecon.query.render import ALPHA_THRESHOLD
+from jsecon.query.selection_masks import ALPHA_THRESHOLD
 
 
 def made_up(seed, count=14, tiles=40, views=2):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from experiments.baselines.evidence import Evidence
 from experiments.datasets import twins
-from experiments.rivals.evidence import Evidence
 
 SMALL = {"views": 6, "width": 64, "height": 48, "num_objects": 6}
 

@@ -28,7 +28,7 @@ NO_REGION = 65535
 """code of a Gaussian without a region"""
 
 
-def page(field: LanguageField, texts: Mapping[str, Answer | None], *, title: str, served: bool = False) -> str:
+def field_page(field: LanguageField, texts: Mapping[str, Answer | None], *, title: str, served: bool = False) -> str:
     """Makes the page of a field, which highlights some texts when it opens.
 
     A served page asks for the answers that are None.

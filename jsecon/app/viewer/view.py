@@ -6,7 +6,7 @@ from pathlib import Path
 from jsecon.app import verbs
 from jsecon.app.records import Answer
 from jsecon.app.scene import open_scene
-from jsecon.app.viewer.page import page
+from jsecon.app.viewer.page import field_page
 from jsecon.errors import InputError
 from jsecon.files import write_text
 from jsecon.pipeline.options import require_writable
@@ -43,7 +43,7 @@ def _export_page(verb: verbs.View, file: Path, console: Console) -> verbs.VerbRe
         results = scene.ask_all(verb.texts)
         answers = {str(answer.query): answer for answer in results if isinstance(answer, Answer)}
         errors = [error for error in results if isinstance(error, InputError)]
-        write_text(file, page(scene.field, answers, title=scene.name))
+        write_text(file, field_page(scene.field, answers, title=scene.name))
     for answer in answers.values():
         console.print_line(str(answer))
     console.print_line(f"page    {file}, texts answered: {len(answers)}")

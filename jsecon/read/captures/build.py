@@ -112,11 +112,11 @@ def _choose(frames: Sequence[_Frame], options: FrameOptions) -> list[_Frame]:
 
 def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.ndarray, " t"], list[str]]:
     """Chooses held-out frames: by the options, by the capture's own split, or every eighth photograph's; adds notes."""
-    own = np.array([bool(frame.posed.held_out) for frame in frames])
+    split = np.array([bool(frame.posed.held_out) for frame in frames])
     has_split = any(frame.posed.held_out is not None for frame in frames)
     if has_split and options.holdout is None:
-        held_out = own
-        notes = [f"{own.sum()} of {len(own)} frames are held out, those that the capture's own split sets aside."]
+        held_out = split
+        notes = [f"{split.sum()} of {len(split)} frames are held out, those that the capture's own split sets aside."]
     else:
         every = 8 if options.holdout is None else options.holdout  # as in Mip-NeRF 360 and INRIA's split
         held_out = _photographs(frames)[0] % every == 0 if every else np.zeros(len(frames), bool)

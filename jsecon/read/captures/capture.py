@@ -274,6 +274,6 @@ def _no_capture(path: Path) -> InputError:
         remedy = f"Give the capture's own folder, for example {captures[0]}."
     elif unread := list(filter(unread_remedy, [*entries, *path.glob("images/*")])):
         problem, remedy = f"{len(unread)} {unread[0].suffix} images, which are not read", unread_remedy(unread[0])
-    elif given := [*filter(is_video, entries), *scenes]:
-        remedy = f"Give the video or the scene: jsecon run {given[0]}"
+    elif inputs := [*filter(is_video, entries), *scenes]:
+        remedy = f"Give the video or the scene: jsecon run {inputs[0]}"
     return InputError(path, problem, expected, remedy)

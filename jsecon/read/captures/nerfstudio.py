@@ -21,7 +21,7 @@ from jsecon.read.captures.frames import PosedImage, PosedImages, make_rigid
 from jsecon.read.captures.images import find_image, image_header, without_image_suffix
 from jsecon.read.captures.lens import PANORAMA, Lens, panorama_lens
 from jsecon.read.registry import Reader
-from jsecon.read.splats.points import load_point_cloud
+from jsecon.read.splats.point_clouds import load_point_cloud
 from jsecon.types import UpAxis
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE"}

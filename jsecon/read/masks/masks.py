@@ -158,7 +158,7 @@ def _open_coco(folder: Path, names: Mapping[str, Sequence[str]]) -> dict[str, Re
     `names` has what the image of each frame may be called, without its suffix and in small letters.
     """
     files = [folder] if folder.is_file() else list(folder.glob("*.json"))
-    known = {name for own in names.values() for name in own}
+    known = {name for spellings in names.values() for name in spellings}
     if len(files) != 1 or files[0].suffix.lower() != ".json" or files[0].stem.lower() in known:
         return None
     file, content = files[0], read_json(files[0], _JSON, _REMEDY)
@@ -171,8 +171,8 @@ def _open_coco(folder: Path, names: Mapping[str, Sequence[str]]) -> dict[str, Re
             records[record["image_id"]].append(record)
         images = {str(image["file_name"]).lower(): image for image in content["images"]}
         images |= {without_image_suffix(name): image for name, image in images.items()}
-        for frame, own in names.items():
-            for image in [images[name] for name in own if name in images][:1]:
+        for frame, spellings in names.items():
+            for image in [images[name] for name in spellings if name in images][:1]:
                 found[frame] = functools.partial(_decode_records, file, records[image["id"]], image)
         if not found:
             raise ValueError(f"none of its {len(records)} images is called like a frame, as {next(iter(names))} is")
@@ -244,7 +244,7 @@ def _find_masks(
     for number, found in enumerate(objects.values(), start=1):
         for name, path in found.items():
             paths[name][number] = path
-    return {name: functools.partial(_read_objects, own) for name, own in paths.items()}, [note]
+    return {name: functools.partial(_read_objects, mask_files) for name, mask_files in paths.items()}, [note]
 
 
 def _find_ignored(frames: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int | None, list[str]]:
@@ -252,16 +252,16 @@ def _find_ignored(frames: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[int 
 
     It is one of _LARGEST, far above the others, most of which it touches.
     """
-    ids = np.unique(np.concatenate([own[own > 0] for own, _ in frames] or [[0]]))
+    ids = np.unique(np.concatenate([frame_ids[frame_ids > 0] for frame_ids, _ in frames] or [[0]]))
     if len(ids) < 3 or ids[-1] not in _LARGEST or ids[-1] - ids[-2] <= 2 * np.diff([0, *ids[:-1]]).max():
         return None, []
     touched = count = 0
-    for own, labels in frames:
-        if ids[-1] in own:
-            inside = labels == len(own) - 1
+    for frame_ids, labels in frames:
+        if ids[-1] in frame_ids:
+            inside = labels == len(frame_ids) - 1
             around = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3))) > 0
-            touched += (own[np.unique(labels[around & (labels >= 0)])] > 0).sum() - 1
-            count += (own > 0).sum() - 1
+            touched += (frame_ids[np.unique(labels[around & (labels >= 0)])] > 0).sum() - 1
+            count += (frame_ids > 0).sum() - 1
     if touched < 0.8 * count:
         return None, []
     borders = "it lies along the borders of the others and is the largest number of its type"
@@ -317,7 +317,7 @@ class _Source:
 
     def __init__(self, folder: Path, names: Sequence[str], size: tuple[int, int], frames: AllFrames | None, level: str):
         self.size, self.frames, self.notes = size, frames or dict.fromkeys(names), []
-        mask_names = {name: own for name, own in _mask_names(self.frames).items() if name in names}
+        mask_names = {name: spellings for name, spellings in _mask_names(self.frames).items() if name in names}
         found = _open_coco(folder, mask_names)
         if found is None:
             found, self.notes = _find_masks(folder, mask_names, readers("jsecon.masks", READERS), level)

@@ -117,8 +117,8 @@ def _save_ply(
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(_header(gaussians.count, properties))
         for rows, block in _usable_blocks(path, gaussians, similarity):
-            own = {name: np.asarray(column[rows]) for name, column in ids.items()}
-            file.write(_table(block, is_double, own).tobytes())  # tofile hides a full disk
+            block_ids = {name: np.asarray(column[rows]) for name, column in ids.items()}
+            file.write(_table(block, is_double, block_ids).tobytes())  # tofile hides a full disk
 
 
 def _header(count: int, properties: list[str]) -> bytes:
@@ -187,11 +187,11 @@ def _save_usda(
         file.write('    uniform token[] xformOpOrder = ["xformOp:translate"]\n')
         for number in np.unique(objects):
             rows = np.flatnonzero(objects == number)
-            own = {name: int(column[rows[0]]) for name, column in ids.items()}
+            labels = {name: int(column[rows[0]]) for name, column in ids.items()}
             name = names[int(number)] if 0 <= number < len(names) else ""
             word = re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_")
             prim = "rest" if number < 0 else f"object_{number:03d}{'_' * bool(word)}{word}"
-            data = [f"int {key} = {value}" for key, value in own.items()]
+            data = [f"int {key} = {value}" for key, value in labels.items()]
             data += [f"string name = {json.dumps(name, ensure_ascii=False)}"]
             file.write(f'\n    def ParticleField3DGaussianSplat "{prim}" (\n        customData = {{\n')
             file.writelines(f"            {line}\n" for line in data)

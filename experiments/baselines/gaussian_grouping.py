@@ -1,6 +1,6 @@
 """Gaussian Grouping-m: 16-d identity codes and a classifier of tracked ids; a text is looked up in the first frame.
 
-After Ye et al. 2024 (lkeab/gaussian-grouping, train.py), with the geometry frozen as for all rivals here: theirs is
+After Ye et al. 2024 (lkeab/gaussian-grouping, train.py), with the geometry frozen as for all baselines here: theirs is
 trained too. The text query needs the object in the first view, where theirs asks Grounding DINO and SAM and this asks
 that frame's masks.
 """
@@ -19,8 +19,8 @@ import optax
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from experiments.rivals.descent import descend
-from experiments.rivals.evidence import Evidence, view_plans, with_room
+from experiments.baselines.descent import descend
+from experiments.baselines.evidence import Evidence, view_plans, with_room
 from jsecon.errors import InputError
 from jsecon.paper.queries import _relevancies
 from jsecon.splat.plan import plan_view, render_plan

@@ -1,4 +1,4 @@
-"""The training-free rivals: a Gaussian's feature is a weighted mean of the embeddings of the masks that it lies in.
+"""The training-free baselines: a Gaussian's feature is a weighted mean of the embeddings of the masks that it lies in.
 
 They differ in the weights alone. Occam's LGS (Cheng et al. 2024; insait-institute/OccamLGS): alpha T at the pixel of
 the centre. Weighted back-projection (LUDVIG without its diffusion, Marrie et al. 2025, naver/ludvig; gradient-weighted
@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from experiments.rivals.evidence import Evidence, local_masks
+from experiments.baselines.evidence import Evidence, local_masks
 from jsecon.field.evidence import view_evidence
 from jsecon.paper.queries import _relevancies
 from jsecon.splat.fusion import compute_once

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from experiments.rivals.evidence import Evidence, with_room
+from experiments.baselines.evidence import Evidence, with_room
 from jsecon.paper.autoencoder import decode, encode, train_autoencoder
 from jsecon.paper.distill import distill_l1
 from jsecon.types import Array, Autoencoder

@@ -1,4 +1,4 @@
-"""Each rival does what its own idea promises: trained on perfect masks that agree, it finds each ball by its text."""
+"""Each baseline does what its own idea promises: trained on perfect masks that agree, it finds each ball by text."""
 
 import dataclasses
 
@@ -9,13 +9,13 @@ import pytest
 from balls import HEIGHT, WIDTH, ring_of_balls
 from twin_files import evidence_of_tracks
 
+from experiments.baselines import lifting
+from experiments.baselines.evidence import local_masks
+from experiments.baselines.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
+from experiments.baselines.langsplat import train_langsplat
+from experiments.baselines.opengaussian import Schedule, train_opengaussian
 from experiments.datasets.ovs3d import box_of
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text
-from experiments.rivals import lifting
-from experiments.rivals.evidence import local_masks
-from experiments.rivals.gaussian_grouping import query_gaussian_grouping, train_gaussian_grouping
-from experiments.rivals.langsplat import train_langsplat
-from experiments.rivals.opengaussian import Schedule, train_opengaussian
 from experiments.simulated_vision.embeddings import made_text_space
 from jsecon import InputError, plan_view, project
 from jsecon.evaluate.lerf import evaluate_labels

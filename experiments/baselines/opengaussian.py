@@ -19,9 +19,9 @@ import numpy as np
 import optax
 from jaxtyping import Float, Int
 
-from experiments.rivals.descent import descend
-from experiments.rivals.evidence import Evidence, local_masks, only, view_plans
-from experiments.rivals.leaves import assign_to_centres, cluster_means, split_roots, view_overlaps
+from experiments.baselines.descent import descend
+from experiments.baselines.evidence import Evidence, local_masks, only, view_plans
+from experiments.baselines.leaves import assign_to_centres, cluster_means, split_roots, view_overlaps
 from jsecon.numerics import normalize, safe_norm
 from jsecon.splat.plan import ViewPlan, render_plan
 from jsecon.types import Array

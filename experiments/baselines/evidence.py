@@ -1,4 +1,4 @@
-"""What every rival learns from: one set of Gaussians, the masks of each frame, and how a tracker joined them."""
+"""What every baseline learns from: one set of Gaussians, the masks of each frame, and how a tracker joined them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _INVISIBLE = -100.0
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """A scene as the rivals see it; a pytree."""
+    """A scene as the baselines see it; a pytree."""
 
     gaussians: Gaussians
     cameras: Camera

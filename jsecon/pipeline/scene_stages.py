@@ -38,14 +38,14 @@ from jsecon.read.captures.frames import (
 from jsecon.read.captures.lens import undistorted_pinhole
 from jsecon.read.captures.nerfstudio import source_from_trained
 from jsecon.read.captures.video import DEFAULT_VIDEO_FRAMES, has_panorama_mark, is_video, write_frames
-from jsecon.read.splats.points import gaussians_of_cloud
+from jsecon.read.splats.point_clouds import gaussians_of_cloud
 from jsecon.splat.render import render_depth
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import transform_gaussians
 from jsecon.types import Camera, Capture, Gaussians, Progress, UpAxis
-from jsecon.views.capture import render_capture
 from jsecon.views.frame import find_up_axis, scene_frame, surface_points
-from jsecon.views.plan import DEFAULT_VIEWS, cover_with, place_cameras
+from jsecon.views.placing import DEFAULT_VIEWS, cover_with, place_cameras
+from jsecon.views.rendered import render_capture
 
 MIN_GAP_DB, MIN_GAP_SPREADS = 5.0, 5.0
 """Least distance below the median PSNR at which a frame is called weak, in dB, and in median absolute deviations."""
@@ -80,11 +80,11 @@ def plan_capture(context: RunContext) -> list[Stage]:
     else:
         return [_plan_load(context, capture)]
     key_options |= context.key_options("panoramas")
-    how = f"found by structure from motion (pycolmap) for {what}"
+    task = f"found by structure from motion (pycolmap) for {what}"
     if context.options.points is not None:
         problem = "the photographs have no poses, so no world that the points could be in"
         raise InputError("--points", problem, "", "Give a capture with poses in the world of the points.")
-    poses = Stage("poses", how, _estimate_poses, key_options=key_options, files=tuple(files))
+    poses = Stage("poses", task, _estimate_poses, key_options=key_options, files=tuple(files))
     return [poses, dataclasses.replace(_plan_load(context, None), after=("poses",))]
 
 
@@ -101,19 +101,19 @@ def _plan_load(context: RunContext, capture: Path | None) -> Stage:
     """
     options = context.options
     key_options = context.key_options("long_side", "frames", "holdout")
-    how = f"frames, long side at most {options.long_side} px"
-    how += ", held out by the capture's own split or 1 in 8" * (options.holdout is None)
+    task = f"frames, long side at most {options.long_side} px"
+    task += ", held out by the capture's own split or 1 in 8" * (options.holdout is None)
     refine = _refinement(options, capture)
     if refine != "never":
         key_options |= context.key_options("seed", "steps", "minutes") | {"refine": refine}
-        how += ", corrected by short fits"
-        how += " in about half of the fit's time where that helps" * (refine == "auto")
+        task += ", corrected by short fits"
+        task += " in about half of the fit's time where that helps" * (refine == "auto")
     if options.ignore is not None:
         models = context.models
         key_options |= context.key_options("ignore") | {"embedder": models.embedder.name}
         key_options["segmenter"] = None if models.segmenter is None else models.segmenter.name
-        how += f", without the pixels of {options.ignore}"
-    return Stage("load", how, _load_frames, key_options=key_options, files=(capture, options.points))
+        task += f", without the pixels of {options.ignore}"
+    return Stage("load", task, _load_frames, key_options=key_options, files=(capture, options.points))
 
 
 def _plan_rendered_views(context: RunContext) -> Stage:
@@ -122,13 +122,13 @@ def _plan_rendered_views(context: RunContext) -> Stage:
     files = (options.capture, options.cameras, near, near and _near(options.capture, _TRAINED))
     key_options = context.key_options("views", "up", "long_side")
     if options.cameras is not None:
-        how = f"the scene rendered from the poses of {options.cameras.name}"
+        task = f"the scene rendered from the poses of {options.cameras.name}"
         key_options = context.key_options("long_side")
     elif near is not None:
-        how = f"{_NEAR_VIEWS} of the poses of {near}, or planned views if these do not show {options.capture.name}"
+        task = f"{_NEAR_VIEWS} of the poses of {near}, or planned views if these do not show {options.capture.name}"
     else:
-        how = f"{options.views or DEFAULT_VIEWS} virtual views, planned from the Gaussians of {options.capture.name}"
-    return Stage("load", how, _render_views, key_options=key_options, files=files)
+        task = f"{options.views or DEFAULT_VIEWS} virtual views, planned from the Gaussians of {options.capture.name}"
+    return Stage("load", task, _render_views, key_options=key_options, files=files)
 
 
 def _near(scene: Path, *names: str) -> Path | None:
@@ -145,8 +145,8 @@ def _poses_near(options: Options) -> Path | None:
 
 def plan_scene(context: RunContext) -> list[Stage]:
     """Plans the capture, the Gaussians, and the quality of the scene if there are photographs: the last."""
-    how = "PSNR and SSIM of the rendered colours"
-    held_out = Stage("held_out", how, _measure_held_out, after=("load", "gaussians"), distributed=True)
+    task = "PSNR and SSIM of the rendered colours"
+    held_out = Stage("held_out", task, _measure_held_out, after=("load", "gaussians"), distributed=True)
     scene = [*plan_capture(context), _plan_gaussians(context)]
     return scene if is_bare_scene(context.options.capture) else [*scene, held_out]
 
@@ -158,13 +158,13 @@ def _plan_gaussians(context: RunContext) -> Stage:
     path = options.capture if bare else options.gaussians
     if path is None:
         length = f"{options.steps} steps" if options.minutes is None else f"{options.minutes:g} minutes"
-        how, key_options = f"fitted to the frames in {length}", context.key_options("steps", "minutes", "seed")
-        return Stage("gaussians", how, _fit_scene, after=("load",), key_options=key_options)
+        task, key_options = f"fitted to the frames in {length}", context.key_options("steps", "minutes", "seed")
+        return Stage("gaussians", task, _fit_scene, after=("load",), key_options=key_options)
     transform = None if bare else _near(path, _TRAINED)
     key_options = {} if transform is None else {"trained": transform.read_text(errors="replace")}
     read = _read_bare_scene if bare else _read_gaussians_of_capture
-    how = f"read from {path.name}"
-    return Stage("gaussians", how, read, after=("load",), key_options=key_options, files=(path,))
+    task = f"read from {path.name}"
+    return Stage("gaussians", task, read, after=("load",), key_options=key_options, files=(path,))
 
 
 def _estimate_poses(stage: StageInput) -> StageResult:
@@ -237,8 +237,8 @@ def _with_points(capture: Capture, path: Path, progress: Progress) -> Capture:
             depths[t] = np.where(alpha > 0.5, depth, 0)
             progress(n + 1, len(train))
     colours = np.rint(255 * np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)).astype(np.uint8)
-    given = {"points": np.asarray(scene.means), "point_colors": colours, "depths": depths}
-    return dataclasses.replace(capture, **given, notes=(*capture.notes, *notes))
+    changes = {"points": np.asarray(scene.means), "point_colors": colours, "depths": depths}
+    return dataclasses.replace(capture, **changes, notes=(*capture.notes, *notes))
 
 
 def _check_overlap(gaussians: Gaussians, cameras: Camera, where: str) -> None:
@@ -428,23 +428,23 @@ def _choose_near(
     for n, world in enumerate(worlds):
         if not any(np.allclose(world, other) for other in worlds[:n]):
             scene_from_poses = np.linalg.inv(source_from_scene) @ world
-            there = _moved(cameras[rows], scene_from_poses)
-            views.append((cover_with(scene, there, _NEAR_VIEWS, progress), there, scene_from_poses))
+            moved = _moved(cameras[rows], scene_from_poses)
+            views.append((cover_with(scene, moved, _NEAR_VIEWS, progress), moved, scene_from_poses))
     best = max(cover.coverage for cover, _, _ in views)
-    cover, there, scene_from_poses = next(view for view in views if view[0].coverage >= best - 0.05)
+    cover, moved, scene_from_poses = next(view for view in views if view[0].coverage >= best - 0.05)
     found = f"{len(cameras)} cameras, {cover.usable:.0%} of which show {cover.coverage:.0%} of {options.capture.name}"
     if min(len(rows) / 2, cover.usable / _LEAST_USABLE, cover.coverage / _LEAST_COVERAGE) < 1:
         remedy = (
             "Put poses in the world of the scene there, with the dataparser_transforms.json of nerfstudio's training."
         )
         raise InputError(near, found, f"2 cameras, {_LEAST_USABLE:.0%} and {_LEAST_COVERAGE:.0%} or more", remedy)
-    up = find_up_axis(scene, there)
+    up = find_up_axis(scene, moved)
     if posed.up is not None:
         axis = scene_from_poses[:3, :3] @ posed.up.axis
         up = dataclasses.replace(posed.up, axis=tuple((axis / np.linalg.norm(axis)).tolist()))
     note = f"{len(cover.chosen)} views at poses of {near}: {found}."
     chosen = np.sort(cover.chosen)
-    return _Views(there[chosen], [names[row] for row in rows[chosen]], (note,), up)
+    return _Views(moved[chosen], [names[row] for row in rows[chosen]], (note,), up)
 
 
 def _world_of_scene(gaussians: Gaussians) -> np.ndarray:

@@ -26,7 +26,7 @@ from jsecon.errors import InputError
 from jsecon.files import parse_json, reading
 from jsecon.read.registry import SCENES, Reader, decoding, readers
 from jsecon.read.splats.ply import read_ply, read_ply_file, require_drawable
-from jsecon.read.splats.points import READERS as POINTS, gaussians_of_cloud
+from jsecon.read.splats.point_clouds import READERS as POINTS, gaussians_of_cloud
 from jsecon.splat.project import unusable_rows
 from jsecon.splat.sh import C0
 from jsecon.splat.transform import float32_rounding, transform_gaussians

@@ -1,4 +1,4 @@
-"""Adam on one view per step, all views before any repeats: how every trained rival is trained."""
+"""Adam on one view per step, all views before any repeats: how every trained baseline is trained."""
 
 import functools
 from collections.abc import Callable

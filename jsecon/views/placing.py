@@ -38,10 +38,10 @@ _LEAST_ALPHA = 0.03
 """mean alpha of a view from which it shows some of the scene"""
 SEEN_PX = 0.3
 """px of rendering weight from which a view shows a Gaussian"""
-LOOKS = 8
+ENOUGH = 8
 """frames with masks that should show a Gaussian: its object is what most of them agree on"""
 LEAST_GAIN = 0.01
-"""share of the Gaussians that a further frame must show to one that lacks looks"""
+"""share of the Gaussians that a further frame must show to one that too few chosen frames show"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,8 +326,8 @@ def _weights_by_view(
         shown = weights[counted.sample]
         with np.errstate(invalid="ignore"):  # centres that are not finite have no weight
             depth = means @ poses[t, 2, :3] + poses[t, 2, 3]
-        wide = widest * cameras.fx[t] > 0.1 * cameras.width * depth
-        return shown, weights[counted.inner].sum() / pixels, shown[wide].sum() / max(shown.sum(), 1e-30)
+        is_wide = widest * cameras.fx[t] > 0.1 * cameras.width * depth
+        return shown, weights[counted.inner].sum() / pixels, shown[is_wide].sum() / max(shown.sum(), 1e-30)
 
     found = [*each_view(gaussians.count, len(poses), view, progress)]
     seen = np.array([shown for shown, _, _ in found], np.float32).reshape(len(poses), len(means))
@@ -340,7 +340,7 @@ def frames_by_need(
 ) -> Int[np.ndarray, " k"]:
     """Chooses at most `limit` of T frames for masks, those that show most of the scene first.
 
-    A frame is needed where it shows Gaussians that fewer than `LOOKS` chosen frames show. Several processes that make
+    A frame is needed where it shows Gaussians that fewer than `ENOUGH` chosen frames show. Several processes that make
     the same call share the work.
     """
     counted = np.unique(np.linspace(0, gaussians.count - 1, min(gaussians.count, 100_000)).astype(int))
@@ -350,10 +350,10 @@ def frames_by_need(
         weights = view_evidence(gaussians, cameras[t], whole, 1).matrix(gaussians.count, 1).sum(1)
         return np.minimum(np.asarray(weights, np.float32)[counted, 0] / SEEN_PX, 1)
 
-    looks = np.stack(map_views(len(cameras), shown, progress))
+    visible = np.stack(map_views(len(cameras), shown, progress))
     views = len(cameras) if limit is None else limit
 
     def choose(rows: Sequence[int]) -> list[np.ndarray]:
-        return [_greedy_cover(looks, looks.max(0) > 0, views, enough=LOOKS, least_gain=LEAST_GAIN) for _ in rows]
+        return [_greedy_cover(visible, visible.max(0) > 0, views, enough=ENOUGH, least_gain=LEAST_GAIN) for _ in rows]
 
     return map_over_processes(1, choose)[0]  # one process chooses: others may round otherwise
