@@ -175,3 +175,5 @@ def test_broken_texts_and_regions_select_nothing(field):
 def test_pixels_that_are_not_there_are_told(field, frame, x, y, match):
     with pytest.raises(InputError, match=match):
         region_at(field, frame, x, y)
+    with pytest.raises(InputError, match="no such frame in the field"):
+        region_at(dataclasses.replace(field, names=()), frame, x, y)

@@ -154,7 +154,7 @@ def matched(w: World) -> list:
     return [(match.chosen, (w.r,)), *selected(jsecon.select_gaussians(w.field, match), w)]
 
 
-SCENE, FIELD = "n1 n0 d1", "n1 n0 t1 r0 d1"
+SCENE, FIELD = "n1 n0 d1", "n1 n0 t1 t0 r0 d1"
 CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
     "project": ("n1 n0", lambda w: [(jsecon.project(w.gaussians, w.camera).means_px, (w.n, 2))]),
     "render": (SCENE, lambda w: image(jsecon.render(w.gaussians, w.camera, w.rows(w.n), depth=True), w.d)),
@@ -169,9 +169,9 @@ CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
     "distill_l1": ("n1 n0 t1 d1 uint8", distilled),
     "query_anchored": (FIELD, lambda w: selected(jsecon.query_anchored(w.field, w.rows(1)[0]), w)),
     "query_several": (FIELD, lambda w: selected(jsecon.query_several(w.field, w.rows(2)), w)),
-    "query_region": ("n1 n0 t1 d1", lambda w: selected(jsecon.query_region(w.field, 0), w)),
-    "query_classes": ("n1 n0 t1 d1", lambda w: [(jsecon.query_classes(w.field, w.rows(3)).labels, (w.n,))]),
-    "match_regions": ("n1 n0 t1 d1", matched),
+    "query_region": (FIELD, lambda w: selected(jsecon.query_region(w.field, 0), w)),
+    "query_classes": ("n1 n0 t1 r0 d1", lambda w: [(jsecon.query_classes(w.field, w.rows(3)).labels, (w.n,))]),
+    "match_regions": (FIELD, matched),
     "membership_probability": ("n1 n0", lambda w: [(jsecon.membership_probability(w.votes.total, w.votes), (w.n,))]),
     "mean_iou": ("", lambda _: [(jnp.asarray(jsecon.mean_iou([0.5, None])), ())]),
     "accuracy_at": ("", lambda _: [(jnp.asarray(jsecon.accuracy_at([0.5, None])), ())]),
@@ -181,8 +181,8 @@ CALLS: dict[str, tuple[str, Callable[[World], list]]] = {
         "n1 n0 d1",
         lambda w: selected(jsecon.query_canonical(w.rows(w.n), w.rows(1)[0], w.rows(4), 0.5), w),
     ),
-    "lift": ("n1 n0 t1 r0", lifted),
-    "region_at": ("n1 n0 t1", lambda w: [(np.asarray(jsecon.region_at(w.field, 0, 8, 6)), ())]),
+    "lift": ("n1 n0 t1 r0 d1", lifted),
+    "region_at": ("n1 n0 t1 r0 d1", lambda w: [(np.asarray(jsecon.region_at(w.field, 0, 8, 6)), ())]),
     "selection_mask": ("n1 n0", lambda w: [(jsecon.selection_mask(w.gaussians, w.camera, w.ones), (HEIGHT, WIDTH))]),
     "remove_outliers": ("n1 n0", lambda w: [(jsecon.remove_outliers(w.gaussians.means, w.ones), (w.n,))]),
     "object_shapes": ("n1 n0 r0", shapes),

@@ -174,6 +174,6 @@ def frame_index(field: LanguageField, frame: int | str) -> int:
         index = int(digits[1]) if digits else -1
     if isinstance(index, int | np.integer) and 0 <= index < len(names):
         return int(index)
-    known = f"a name ({names[0]} ... {names[-1]}) or a place, #0 to #{len(names) - 1}"
+    known = f"a name ({names[0]} ... {names[-1]}) or a place, #0 to #{len(names) - 1}" if names else ""
     remedy = "report.html of the run shows the frames."
     raise InputError(f"frame {frame}", "no such frame in the field", known, remedy)
