@@ -82,7 +82,10 @@ def _is_apart(
 
 
 def _open_views(gaussians: Gaussians, cameras: Camera) -> tuple[Callable, int]:
-    """Opens the views of a scene, or the parts of views of a large one: does what `_view` does of one; their number."""
+    """Makes a function that returns `_view` of a view, and counts the views; those of a large scene are parts of views.
+
+    It takes which Gaussians are seen, the gap, and the number of the view.
+    """
     if gaussians.count <= MAX_WHOLE:  # once for all views
         whole = jax.device_put(dataclasses.replace(gaussians, sh=None))
         return lambda seen, gap, t: _view(whole, seen, cameras[t], gap), len(cameras)
