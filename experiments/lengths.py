@@ -57,10 +57,10 @@ def measure(field: LanguageField, room: Room) -> dict[str, float]:
         found.append((answer.place, ConvexHull(points).volume))
     volumes = []
     for points, (place, volume) in zip(object_surfaces(field.gaussians, field.cameras, labels), found):
-        solid = object_solid(source_points(field, points), place)
-        a, *rest = solid.size
-        kinds = {"box": np.prod(solid.size), "cylinder": np.pi * a**2 * sum(rest), "sphere": 4 / 3 * np.pi * a**3}
-        volumes.append(np.array([solid.volume, kinds[solid.primitive]]) / volume)
+        hull, primitive = object_solid(source_points(field, points), place).values()
+        a, *rest = size = primitive["size"]
+        kinds = {"box": np.prod(size), "cylinder": np.pi * a**2 * sum(rest), "sphere": 4 / 3 * np.pi * a**3}
+        volumes.append(np.array([hull["volume"], kinds[primitive["type"]]]) / volume)
     pairs = [*itertools.combinations(middles, 2)]
     true = np.array([np.linalg.norm(middles[a] - middles[b]) for a, b in pairs])
     known = int(true.argmax())

@@ -122,8 +122,6 @@ class ImageFile:
     height: int
     orientation: int = 1
     """EXIF's that was applied; 1 if none."""
-    view: int | None = None
-    """Number of the view that was cut from it, if it is a panorama."""
 
 
 @dataclasses.dataclass(frozen=True)

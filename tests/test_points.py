@@ -51,6 +51,8 @@ def test_colours_of_other_kinds_and_intensities(tmp_path):
             grey = np.rint(255 * np.clip((rgb[0] - low) / (high - low), 0, 1))
             expected = np.repeat(grey[:, None], 3, axis=1)
         np.testing.assert_array_equal(colours, expected)
+    np.savetxt(tmp_path / "normals.xyz", np.column_stack([*xyz.values(), *draw.normal(size=(3, 50))]))
+    np.testing.assert_array_equal(load_point_cloud(tmp_path / "normals.xyz").colors, 128)
 
 
 def test_many_points_are_thinned_and_each_finds_its_gaussian(tmp_path, monkeypatch):

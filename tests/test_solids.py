@@ -42,22 +42,23 @@ def test_the_primitive_and_the_volumes_are_those_of_the_thing(kind, lying):
     turn = Rotation.from_euler("z", 20, degrees=True) * turn
     points = turn.apply(surface(kind)) + np.array([5, 6, 7])
     shape = object_shapes(points[::3], np.zeros(1000, int), np.array([0, 0, 1.0]))[0]
-    solid = object_solid(points, shape)
-    assert solid.primitive == kind
-    a, *others = solid.size
-    volume = {"box": np.prod(solid.size), "cylinder": np.pi * a**2 * sum(others), "sphere": 4 / 3 * np.pi * a**3}[kind]
-    assert [solid.volume, volume] == pytest.approx([VOLUMES[kind]] * 2, rel=0.1)
-    first, second, third = (solid.vertices[solid.triangles] - shape.center).transpose(1, 0, 2)
-    assert np.einsum("nk,nk->n", first, np.cross(second, third)).sum() / 6 == pytest.approx(solid.volume, rel=1e-6)
-    np.testing.assert_allclose(np.linalg.det(solid.axes), 1)
+    hull, primitive = object_solid(points, shape).values()
+    assert primitive["type"] == kind
+    size, axes = primitive["size"], primitive["axes"]
+    a, *others = size
+    volume = {"box": np.prod(size), "cylinder": np.pi * a**2 * sum(others), "sphere": 4 / 3 * np.pi * a**3}[kind]
+    assert [hull["volume"], volume] == pytest.approx([VOLUMES[kind]] * 2, rel=0.1)
+    first, second, third = (hull["vertices"][hull["triangles"]] - shape.center).transpose(1, 0, 2)
+    assert np.einsum("nk,nk->n", first, np.cross(second, third)).sum() / 6 == pytest.approx(hull["volume"], rel=1e-6)
+    np.testing.assert_allclose(np.linalg.det(axes), 1)
     if kind == "cylinder":
-        assert abs(solid.axes[:, 2] @ turn.apply([0, 0, 1])) > 0.999
+        assert abs(axes[:, 2] @ turn.apply([0, 0, 1])) > 0.999
 
 
 def test_a_flat_thing_has_a_thin_hull():
     means = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [1, 1, 0]
     shape = object_shapes(means, np.zeros(50, int), np.array([0, 0, 1.0]))[0]
-    assert all(0 < object_solid(points, shape).volume < 0.01 for points in (means, means[:0]))
+    assert all(0 < object_solid(points, shape)["hull"]["volume"] < 0.01 for points in (means, means[:0]))
 
 
 def test_surfaces_are_those_of_the_pixels_that_show_an_object():

@@ -19,7 +19,7 @@ from jsecon.read.captures.capture import load_capture
 from jsecon.read.captures.frames import evenly_spaced
 from jsecon.read.splats.writing import require_writable_format, save_gaussians
 from jsecon.splat.visible import hide
-from jsecon.types import Camera, Capture, Gaussians, Progress
+from jsecon.types import Camera, Capture, Gaussians
 from jsecon.views.clean import KINDS, find_litter
 
 
@@ -32,7 +32,15 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
         raise InputError("--capture", "its poses are the views", remedy="Leave --cameras and --views out.")
     opened = open_scene(verb.scene, console=console) if verb.keep_objects else None
     with console.progress("views") as progress:
-        scene, cameras, capture = _open(verb, console, progress)
+        capture = verb.capture and load_capture(verb.capture, long_side=Options.long_side, progress=progress)
+        if capture is None:
+            scene, _, views = open_bare_scene(Options(verb.scene, cameras=verb.cameras, views=verb.views), progress)
+            cameras, notes = views.cameras, views.notes
+        else:
+            scene, *notes = place_in_capture(read_scene(verb.scene)[0], capture, verb.scene, None, progress)
+            cameras = capture.cameras
+    for note in notes:
+        console.note(note)
     cameras = jax.tree.map(np.asarray, cameras[evenly_spaced(len(cameras), 128)])  # more would show little more
     with console.progress("clean") as progress:
         kinds = find_litter(scene, cameras, progress)
@@ -43,8 +51,8 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
         raise InputError(verb.scene, "no Gaussian would be left", remedy="Check the views: --cameras FILE.")
     words = ", ".join(f"{count} {kind} ({count / len(kinds):.1%})" for kind, count in list(counts.items())[1:])
     console.print_line(f"gone    {words}")
-    with console.progress("quality") as progress:
-        quality, line = _quality(scene, hide(scene, kinds > 0), cameras, capture, progress)
+    with console.progress("quality"):
+        quality, line = _quality(scene, hide(scene, kinds > 0), cameras, capture)
     console.print_line(line)
     with console.progress("files"):
         del scene  # read again, a large one fits into memory once
@@ -53,30 +61,15 @@ def _clean(verb: verbs.Clean, console: Console) -> verbs.VerbResult:
     return {"written": {"scene": verb.out}, "gaussians": counts} | quality
 
 
-def _open(verb: verbs.Clean, console: Console, progress: Progress) -> tuple[Gaussians, Camera, Capture | None]:
-    """Returns the Gaussians in the world of the views, the views, and the photographs."""
-    if verb.capture is None:
-        bare = open_bare_scene(Options(verb.scene, cameras=verb.cameras, views=verb.views), progress)
-        for note in bare.views.notes:
-            console.note(note)
-        return bare.scene, bare.views.cameras, None
-    capture = load_capture(verb.capture, long_side=Options.long_side, progress=progress)
-    placed, note = place_in_capture(read_scene(verb.scene)[0], capture, verb.scene, None, progress)
-    console.note(note)
-    return placed, capture.cameras, capture
-
-
 def _quality(
-    before: Gaussians, after: Gaussians, cameras: Camera, capture: Capture | None, progress: Progress
+    before: Gaussians, after: Gaussians, cameras: Camera, capture: Capture | None
 ) -> tuple[dict[str, Any], str]:
     """Compares pictures before and after, with photographs if there are any, and says what came out."""
     frames = evenly_spaced(len(cameras if capture is None else capture.frames), 12)
     if capture is None:
-        values = []
-        for t in frames:
-            pair = [pictures.render_picture(part, cameras[t]) / np.float32(255) for part in (before, after)]
-            values.append(float(psnr(*pair)))
-        value = float(np.median(values))
+        views = cameras[frames]
+        shots = ([pictures.render_picture(part, view) / np.float32(255) for view in views] for part in (before, after))
+        value = float(np.median([*map(psnr, *shots)]))
         return {"psnr_between": value}, f"quality pictures before and after agree to {value:.2f} dB (median)"
     background = fit_background(before, capture)
     found = [measure_quality(part, capture, frames=frames, background=background) for part in (before, after)]

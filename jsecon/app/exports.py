@@ -1,11 +1,11 @@
 """`jsecon objects` and `jsecon export`: a catalogue as a page and JSON; a scene, objects or their solids as files."""
 
 import contextlib
+import dataclasses
 import json
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -106,24 +106,25 @@ def _export(verb: verbs.Export, console: Console) -> verbs.VerbResult:
 
 def _list_objects(scene: Scene, is_needed: bool, console: Console) -> Catalogue | None:
     """Lists the objects; None with a note where an export can do without and they cannot be had."""
-    reason: Any = "the field is larger than memory"
-    if is_needed or not is_mapped(scene.field):
-        try:
-            return scene.objects()
-        except InputError as error:  # such as no model for the names
-            if is_needed:
-                raise
-            reason = error
-    console.note(f"no labels.json is written: {reason}")
-    return None
+    try:
+        if is_mapped(scene.field) and not is_needed:
+            raise InputError("", "the field is larger than memory")
+        return scene.objects()
+    except InputError as error:  # such as no model for the names
+        if is_needed:
+            raise
+        console.note(f"no labels.json is written: {error}")
+        return None
 
 
 def _check_export(verb: verbs.Export) -> None:
     """Raises InputError for options of an export that say nothing, or that cannot be combined."""
     if verb.out is None and verb.objects is None and verb.shapes is None:
         raise InputError("export", "there is nothing to write", remedy="Give --out scene.ply, --objects or --shapes.")
-    if verb.shapes is not None:
-        _require_shapes_format(verb.shapes)
+    if verb.shapes is not None and verb.shapes.suffix not in ("", *_WRITERS) and not verb.shapes.is_dir():
+        known = f"{', '.join(_WRITERS)}, or a folder"
+        problem = f"its name ends in {verb.shapes.suffix}"
+        raise InputError(verb.shapes, problem, known, "For example: --shapes shapes.xml")
     if verb.only is not None and verb.without is not None:
         raise InputError("--only", "it cannot be combined with --without", remedy="Export twice, with one of them.")
     if verb.objects is not None and (verb.only is not None or verb.without is not None):
@@ -206,31 +207,20 @@ def _write_shapes(scene: Scene, listed: Catalogue, out: Path) -> list[Path]:
     They stand in the capture's world, in metres if the field knows their length.
     """
     field, scale = scene.field, scene.field.metres_per_unit or 1.0
-    wholes = [record for record in listed.records() if record["parent"] is None and not record["surroundings"]]
-    labels = np.full(field.gaussians.count, -1)
-    for n, record in enumerate(wholes):
-        labels[listed.mask(record["id"])] = n
+    owners = np.where(np.append(listed.surroundings, True)[listed.labels], -1, listed.labels)
+    ids, labels = np.unique(np.append(owners, -1), return_inverse=True)  # -1 is the first
     items = []
-    for record, points in zip(wholes, object_surfaces(field.gaussians, field.cameras, labels)):
-        shape = listed.shapes[record["id"]]
-        solid = object_solid(source_points(field, points), shape)
-        hull = {"vertices": scale * solid.vertices, "triangles": solid.triangles, "volume": scale**3 * solid.volume}
-        primitive = {"type": solid.primitive, "size": scale * np.array(solid.size), "axes": solid.axes}
-        box = {"center": scale * shape.center, "size": 2 * scale * shape.half_size, "axes": shape.axes}
-        item = {"id": record["id"], "name": record["name"], "box": box, "hull": hull}
-        items.append(item | {"primitive": primitive | {"center": scale * solid.center}})
+    for n, points in zip(ids[1:].tolist(), object_surfaces(field.gaussians, field.cameras, labels[:-1] - 1)):
+        shape = listed.shapes[n]
+        shape = dataclasses.replace(shape, center=scale * shape.center, half_size=scale * shape.half_size)
+        box = {"center": shape.center, "size": 2 * shape.half_size, "axes": shape.axes}
+        item = {"id": n, "name": listed.names[n], "box": box}
+        items.append(item | object_solid(scale * source_points(field, points), shape))
     unit = "capture units" if scene.field.metres_per_unit is None else "metres"
     files = [out] if out.suffix in _WRITERS else [out / f"shapes{suffix}" for suffix in _WRITERS]
     for file in files:
         write_text(file, _WRITERS[file.suffix](items, unit))
     return files
-
-
-def _require_shapes_format(out: Path) -> None:
-    """Checks that `_write_shapes` knows the suffix of a file, which need not exist, or that it is a folder."""
-    if out.suffix and out.suffix not in _WRITERS and not out.is_dir():
-        expected = f"{', '.join(_WRITERS)}, or a folder"
-        raise InputError(out, f"its name ends in {out.suffix}", expected, "For example: --shapes shapes.xml")
 
 
 def _to_json(items: list[_Item], unit: str) -> str:
@@ -262,29 +252,24 @@ def _to_obj(items: list[_Item], unit: str) -> str:
 
 def _to_mjcf(items: list[_Item], unit: str) -> str:
     """Returns a model for MuJoCo: static bodies, whose primitives collide and whose hulls are seen."""
-    assets, bodies = [], []
+    model, add = ElementTree.Element("mujoco", model="scene"), ElementTree.SubElement
+    model.append(ElementTree.Comment(f" in {unit} "))
+    assets, world = add(model, "asset"), add(model, "worldbody")
     for item in items:
-        name, center = quoteattr(_title(item)), item["primitive"]["center"]
+        name, center = _title(item), item["primitive"]["center"]
         kind, size = item["primitive"]["type"], item["primitive"]["size"]
         half = {"box": 0.5 * size, "sphere": size}.get(kind, np.array([size[0], 0.5 * size[-1]]))
-        assets.append(f"<mesh name={name} vertex={_quoted(item['hull']['vertices'] - center)}/>")
-        bodies.append(
-            f"<body name={name} pos={_quoted(center)}>"
-            f'<geom name={name} type="{kind}" size={_quoted(half)} quat={_quoted(np.roll(_turn(item), 1))} group="3"/>'
-            f'<geom type="mesh" mesh={name} contype="0" conaffinity="0" mass="0"/></body>'
-        )
-    return (
-        f'<mujoco model="scene">\n  <!-- in {unit} -->\n  <asset>\n    '
-        + "\n    ".join(assets)
-        + "\n  </asset>\n  <worldbody>\n    "
-        + "\n    ".join(bodies)
-        + "\n  </worldbody>\n</mujoco>\n"
-    )
+        add(assets, "mesh", name=name, vertex=_numbers(item["hull"]["vertices"] - center))
+        body, turn = add(world, "body", name=name, pos=_numbers(center)), np.roll(_turn(item), 1)
+        add(body, "geom", name=name, type=kind, size=_numbers(half), quat=_numbers(turn), group="3")
+        add(body, "geom", type="mesh", mesh=name, contype="0", conaffinity="0", mass="0")
+    ElementTree.indent(model)
+    return ElementTree.tostring(model, encoding="unicode") + "\n"
 
 
-def _quoted(numbers: Any) -> str:
-    """Returns numbers as an attribute of XML."""
-    return f'"{" ".join(f"{number:.9g}" for number in np.ravel(numbers).tolist())}"'
+def _numbers(numbers: np.ndarray) -> str:
+    """Returns numbers as the value of an attribute."""
+    return " ".join(f"{number:.9g}" for number in np.ravel(numbers).tolist())
 
 
 def _to_moveit(items: list[_Item], unit: str) -> str:
@@ -301,7 +286,5 @@ def _to_moveit(items: list[_Item], unit: str) -> str:
     return json.dumps({"unit": unit, "collision_objects": messages}, indent=2) + "\n"
 
 
-_WRITERS: Mapping[str, Callable[[list[_Item], str], str]] = {
-    ".json": _to_json, ".obj": _to_obj, ".xml": _to_mjcf, ".yaml": _to_moveit
-}  # fmt: skip
+_WRITERS = {".json": _to_json, ".obj": _to_obj, ".xml": _to_mjcf, ".yaml": _to_moveit}
 """suffix -> function that writes objects in a unit as a text"""

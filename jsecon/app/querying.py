@@ -1,10 +1,14 @@
-"""`jsecon query`: its options as questions, and its answers as files: Gaussians, a record, masks, a page of pictures.
+"""`jsecon query` and `jsecon measure`.
+
+The options of a query are its questions, and its answers are files: Gaussians, a record, masks, a page of pictures.
+Lengths between things or points are lines and CSV, and one known length gives a field its scale.
 
 Every query has unique file names, the same in every run: an ordinary text is its name ("red mug" is red-mug), any other
 name ends in a hash of what it stands for (`_file_stem`).
 """
 
 import hashlib
+import itertools
 import json
 import re
 import unicodedata
@@ -16,10 +20,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from jsecon.app import pictures, report, verbs
+from jsecon.app.opening import locate_field
 from jsecon.app.records import Answer, At, Query
 from jsecon.app.scene import Scene, open_scene
 from jsecon.errors import InputError
-from jsecon.files import parse_json, remove_files, write_text
+from jsecon.field.field import save_field
+from jsecon.files import csv_text, parse_json, remove_files, write_text
 from jsecon.pipeline.options import require_writable
 from jsecon.pipeline.progress import Console
 from jsecon.read.captures.images import write_image
@@ -167,3 +173,32 @@ def _hashed(slug: str, key: str) -> str:
     digest = hashlib.sha256(key.encode("utf-8", "surrogatepass")).hexdigest()[:10]
     start = slug.encode("utf-8", "replace")[:_MAX_SLUG_BYTES].decode("utf-8", "ignore")
     return f"{start}--{digest}"
+
+
+def _measure(verb: verbs.Measure, console: Console) -> verbs.VerbResult:
+    """Does the work of `jsecon measure`; the result has the measurements, and the scale of the field."""
+    pairs = [*itertools.combinations(verb.texts, 2), *((ends[:3], ends[3:]) for ends in verb.points)]
+    ends = verb.scale_points
+    if verb.scale is not None and ends is not None:
+        raise InputError("--scale", "it cannot be combined with --scale-points", remedy="Give one known length.")
+    known: Any = verb.scale or (ends and (ends[:3], ends[3:6], ends[6]))
+    if not pairs and known is None:
+        remedy = 'For example: jsecon measure my_field "red mug" "white plate"'
+        raise InputError("measure", "there is nothing to measure", "two texts, --points, or --scale", remedy)
+    scene = open_scene(verb.field, embedder=verb.embedder, console=console)
+    if known is not None:
+        scene = scene.scaled(*known)
+        save_field(locate_field(verb.field).file, scene.field)
+        scale = scene.field.metres_per_unit
+        console.print_line(f"scale   1 unit is {scale:.6g} m, --metres-per-unit {scale:.6g} of a new run")
+    with console.progress("lengths"):
+        rows = [scene.measure(*pair) for pair in pairs]
+    for row in rows:
+        lengths = ", ".join(f"{row[name]:.4g} between {name}" for name in ("centers", "surfaces"))
+        console.print_line(f"{row['a']} to {row['b']}: {lengths} ({row['unit']})")
+    result: verbs.VerbResult = {"measurements": rows, "metres_per_unit": scene.field.metres_per_unit}
+    if verb.out is None:
+        return result
+    write_text(verb.out, csv_text(("a", "b", "surfaces", "centers", "angle", "unit"), rows))
+    console.print_line(f"table   {verb.out}")
+    return result | {"written": {"table": verb.out}}

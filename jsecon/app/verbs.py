@@ -562,7 +562,7 @@ VERBS: dict[type[Verb], str] = {
     Changes: "app.living:_changes",
     Update: "app.living:_update",
     Clean: "app.cleaning:_clean",
-    Measure: "app.measuring:_measure",
+    Measure: "app.querying:_measure",
     View: "app.viewer.view:_view",
     Eval: "app.evaluation:_eval",
     Serve: "app.server:_serve",

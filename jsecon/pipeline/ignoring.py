@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jsecon.errors import InputError
-from jsecon.query.match import compare_words, region_similarities
+from jsecon.query.match import compare_words, rank_among_words, region_similarities
 from jsecon.query.rules import RULES
 from jsecon.read.captures.images import write_image
 from jsecon.types import Capture, Progress
@@ -22,22 +22,19 @@ def ignore_named(capture: Capture, texts: list[str], models: Models, folder: Pat
     Writes FOLDER/<frame>.png as nerfstudio and LichtFeld Studio read masks: black where a photograph's pixels are
     ignored, in its size.
     """
-    segmenter, embedder = models.segmenter, models.embedder
-    if segmenter is None:
-        raise InputError("--ignore", "no network finds masks in the frames", remedy="Add --models auto.")
+    embedder = models.embedder
     named, words = np.asarray(embedder.embed_text(texts)), embed_unrelated_words(embedder)
     ignored = np.zeros(capture.frames.shape[:3], bool) if capture.ignored is None else np.array(capture.ignored)
     found = 0
     for t, (name, file) in enumerate(zip(capture.names, capture.files)):
         frame = np.asarray(capture.frames[t])
-        masks = segmenter(frame, t)
+        masks = models.segmenter(frame, t)
         pixels = masks[_is_named(embedder.embed_regions(frame, masks), named, words)].any(axis=0)
         found += bool(pixels.any())
         ignored[t] |= pixels
-        size = frame.shape[1::-1] if file.view is not None else (file.width, file.height)
-        path = folder / f"{name}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, cv2.resize(np.where(pixels, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
+        kept = np.where(pixels, 0, 255).astype(np.uint8)
+        kept = cv2.resize(kept, (file.width, file.height), interpolation=cv2.INTER_NEAREST)
+        write_image(folder / f"{name}.png", kept)
         progress(t + 1, len(capture.names))
     note = f"{', '.join(texts)}: found and ignored in {found} of {len(ignored)} frames; the masks are in {folder}."
     return dataclasses.replace(capture, ignored=ignored, notes=(*capture.notes, note))
@@ -48,8 +45,7 @@ def _is_named(
 ) -> Bool[np.ndarray, " m"]:
     """Tells which masks show what one of Q texts names: only synonyms among the unrelated words match better."""
     others = compare_words(masks, words, RULES.retrieval)
-    if others is None:
+    if others is None or not others.apart.any():
         raise InputError("--ignore", "the embedder knows no unrelated words to compare with", remedy="Take another.")
     best = np.max([region_similarities(masks, text, words, RULES.retrieval)[0] for text in texts], axis=0)
-    below = np.nansum(others.similarity < best, axis=0) / np.maximum(np.isfinite(others.similarity).sum(axis=0), 1)
-    return (below >= 0.98) & (masks != 0).any(axis=1)
+    return (rank_among_words(best, others) >= 0.98) & (masks != 0).any(axis=1)

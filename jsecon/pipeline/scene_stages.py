@@ -68,8 +68,7 @@ def plan_capture(context: RunContext) -> list[Stage]:
         return [_plan_rendered_views(context)]
     if is_video(capture):
         count, is_round = _frames_of_video(options)
-        kind = "panoramas" if is_round else "frames"
-        what = f"the {count} sharpest {kind} of {capture.name}, evenly spread"
+        what = f"the {count} sharpest {'panoramas' if is_round else 'frames'} of {capture.name}, evenly spread"
         key_options, files = context.key_options("frames"), [capture]
     elif files:
         panoramas, hints = find_panoramas(files, declared=options.panoramas)
@@ -109,9 +108,10 @@ def _plan_load(context: RunContext, capture: Path | None) -> Stage:
         task += ", corrected by short fits"
         task += " in about half of the fit's time where that helps" * (refine == "auto")
     if options.ignore is not None:
-        models = context.models
-        key_options |= context.key_options("ignore") | {"embedder": models.embedder.name}
-        key_options["segmenter"] = None if models.segmenter is None else models.segmenter.name
+        embedder, segmenter = context.models.embedder, context.models.segmenter
+        if segmenter is None:
+            raise InputError("--ignore", "no network finds masks in the frames", remedy="Add --models auto.")
+        key_options |= context.key_options("ignore") | {"embedder": embedder.name, "segmenter": segmenter.name}
         task += f", without the pixels of {options.ignore}"
     return Stage("load", task, _load_frames, key_options=key_options, files=(capture, options.points))
 
@@ -482,7 +482,7 @@ def _load_poses(path: Path, long_side: int) -> tuple[PosedImages, Camera, tuple[
     if not images or len(lenses) < len(images):
         problem = "one of its frames has no size" if images else "it has no frame"
         raise InputError(path, problem, "at least one pose, each with w and h", "Estimate the poses again.")
-    lenses = [undistorted_pinhole(lens, path) if lens.panorama else lens for lens in lenses]
+    lenses = [lens if lens.view is None else undistorted_pinhole(lens, path) for lens in lenses]
     width, height = FrameOptions(long_side=long_side).size((lenses[0].width, lenses[0].height))
     sized = [lens.resized(width, height) for lens in lenses]
     fx, fy, cx, cy = np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in sized], np.float32).T

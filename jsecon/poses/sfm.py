@@ -47,9 +47,6 @@ MIN_EXPLAINED, MIN_EXPLAINED_OF_MEDIAN = 0.6, 0.3
 photograph relative to the median. In a right model of 125 photographs the median was 0.87 and the least 0.59; two
 wrongly placed ones had 0.08 and 0.12."""
 
-_PANORAMA_SIDES = 3
-"""Width of a panorama over that of a photograph of 120 degrees with as many pixels a degree."""
-
 
 class _Job(NamedTuple):
     """Photographs, by the names of their links in WORK/links."""
@@ -247,7 +244,7 @@ def _extract(colmap: Any, job: _Job, work: Path, progress: Progress) -> None:
             reader.camera_model = PANORAMA if is_panorama else "OPENCV"
             colmap.import_images(database, work / "links", colmap.CameraMode.SINGLE, image_names=group, options=reader)
     for group, (width, height), is_panorama in job.lenses:
-        views = _PANORAMA_SIDES if is_panorama else 1
+        views = 3 if is_panorama else 1  # of 120 degrees side by side, with as many pixels a degree
         options.max_image_size, options.sift.max_num_features = 1600 * views, 8192 if is_panorama else 4096
         # Features of small photographs are also detected at twice the size: 5,400 instead of 880 on photographs of 799
         # x 532, where 880 gave wrong poses.

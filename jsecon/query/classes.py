@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jsecon.errors import require
 from jsecon.field.membership import SHARE_THRESHOLD, inside_fraction, ratio, vote_columns
-from jsecon.query.match import compare_words, region_similarities, view_count_weight
+from jsecon.query.match import compare_words, rank_among_words, region_similarities, view_count_weight
 from jsecon.query.rules import ABSENT, RULES, QueryRules
 from jsecon.types import Array, LanguageField
 
@@ -85,13 +85,8 @@ def _classes(embeddings, texts, pixels, votes, words, rules: QueryRules, standar
     def at_best(table):
         return jnp.take_along_axis(table, best[:, None], axis=1)[:, 0]
 
-    rank_and_margin = None
     word_scores = compare_words(embeddings, words, rules.retrieval)
-    if word_scores is not None:
-        scores = word_scores.similarity
-        count = jnp.sum(jnp.isfinite(scores), axis=0)
-        below = jnp.sum(scores < at_best(plain), axis=0, dtype=plain.dtype)
-        rank_and_margin = (jnp.where(count > 0, below / jnp.maximum(count, 1), 1.0), None)
+    rank_and_margin = None if word_scores is None else (rank_among_words(at_best(plain), word_scores), None)
     accepted = (rules.judge(rank_and_margin, at_best(plain)) > ABSENT) & known & jnp.any(valid)
     count = votes.regions.shape[0]
 

@@ -126,6 +126,14 @@ def score_text(
     return _TextScores(similarity, known, best, state, rank)
 
 
+def rank_among_words(similarity: Float[Array, " r"], words: _WordScores) -> Float[Array, " r"]:
+    """Computes the share of unrelated words that match each region less than `similarity`; 1 if none is known."""
+    xp = array_module(similarity, words.similarity)
+    count = xp.isfinite(words.similarity).sum(axis=0)
+    below = (words.similarity < similarity).sum(axis=0, dtype=similarity.dtype)
+    return xp.where(count > 0, below / xp.maximum(count, 1), 1.0)
+
+
 def region_similarities(
     embeddings: Float[Array, "r e"], text: Float[Array, " e"], words: Float[Array, "w e"] | None, retrieval: str
 ) -> tuple[Float[Array, " r"], Bool[Array, " r"]]:

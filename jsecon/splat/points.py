@@ -118,8 +118,7 @@ def gaussians_from_points(
 def nearest_gaussians(points: Float[np.ndarray, "p 3"], gaussians: Gaussians) -> Int[np.ndarray, " p"]:
     """Finds the Gaussian that each point belongs to: the nearest, or -1 beyond three times its size, or the median."""
     sizes = np.exp(np.asarray(gaussians.log_scales, np.float64).max(axis=1))
-    reach, known = 3 * np.maximum(sizes, np.median(sizes)), np.isfinite(points).all(axis=1)
-    nearest = np.full(len(points), -1)
-    distances, found = KDTree(np.asarray(gaussians.means)).query(points[known], workers=cores())
-    nearest[known] = np.where(distances <= reach[found], found, -1)
-    return nearest
+    reach, known = 3 * np.maximum(sizes, np.median(sizes)), np.all(np.isfinite(points), axis=1)
+    tree = KDTree(np.asarray(gaussians.means))
+    distances, nearest = tree.query(np.where(known[:, None], points, 0), workers=cores())
+    return np.where(known & (distances <= reach[nearest]), nearest, -1)

@@ -9,6 +9,7 @@ only what overlaps with hardly any other Gaussian goes.
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -27,11 +28,10 @@ FAINT = 1 / 255
 """Largest weight of a pixel below which a Gaussian changes no picture of 8 bits."""
 HAZE = 0.1
 """Largest weight of a pixel below which what hangs in front of a surface is called haze."""
-_FIRST_SHARE, _SHARE = 0.4, 0.6
-"""Shares of a Gaussian's weight in front of surfaces from which it is left out of the second pass, and goes. Measured
-with experiments/clean.py."""
-_FIRST_GAP, _GAP = 0.03, 0.06
-"""Shares of the depth by which a surface lies behind what hangs in front of it, in each pass."""
+_PASSES = ((0.4, 0.03), (0.6, 0.06))
+"""Of each pass the share of a Gaussian's weight in front of surfaces from which it is left out of the second pass, and
+goes; and the share of the depth by which a surface lies behind what hangs in front of it. Measured with
+experiments/clean.py."""
 _NEIGHBOURS, _COMPANY = 9, 2
 """Nearest Gaussians that are asked for, and number of these with which what belongs to a surface overlaps."""
 _REACH = (0.8, 1.0)
@@ -44,58 +44,63 @@ _STEP = 0.01
 """Ratio of two depths that are told apart, less one."""
 
 
-def find_litter(gaussians: Gaussians, cameras: Camera, progress: Progress | None = None) -> Int8[np.ndarray, " n"]:
+def find_litter(
+    gaussians: Gaussians, cameras: Camera, progress: Progress = lambda done, total: None
+) -> Int8[np.ndarray, " n"]:
     """Finds the kind (`KINDS`) of each of N Gaussians from T views that cover the scene.
 
     Above `MAX_WHOLE` Gaussians, memory beside them is that of a part of one view.
     """
-    count, seen = gaussians.count, np.ones(gaussians.count, bool)
-    means = np.asarray(gaussians.means, np.float32)
-    peak = np.zeros(count, np.float32)
-    reach = np.exp(np.asarray(gaussians.log_scales).max(1))
-    seen_by, room, side = None, [0, 0], math.ceil(math.sqrt(count / _PART))
-    if count <= MAX_WHOLE:  # once for all views
-        gaussians = jax.device_put(dataclasses.replace(gaussians, sh=None))
-    else:
-        seen_by = functools.lru_cache(1)(lambda t, views=cameras: visible_part(gaussians, views[t]))
-        cameras = _divided(cameras, side)
-    for n, (least, gap) in enumerate(((_FIRST_SHARE, _FIRST_GAP), (_SHARE, _GAP))):
+    count, (view, views) = gaussians.count, _open_views(gaussians, cameras)
+    seen = np.ones(count, bool)
+    for n, (least, gap) in enumerate(_PASSES):
         front, total, peak = np.zeros((3, count), np.float32)
-
-        def view(t: int, seen=seen, gap=gap) -> tuple[np.ndarray, ...]:
-            if seen_by is None:
-                return _view(gaussians, seen, cameras[t], gap)
-            return _part(*seen_by(t // side**2), seen, cameras[t], gap, room)
-
-        def report(done: int, views: int, first: int = n * len(cameras)) -> None:
-            if progress is not None:
-                progress(first + done, 2 * views)
-
-        for rows, own_front, own_total, own_peak in each_view(count, len(cameras), view, report):
+        cast = functools.partial(view, seen, gap)
+        found = each_view(count, views, cast, lambda done, _, n=n: progress(n * views + done, 2 * views))
+        for rows, own_front, own_total, own_peak in found:
             front[rows] += own_front
             total[rows] += own_total
             peak[rows] = np.maximum(peak[rows], own_peak)
         seen = front < least * np.maximum(total, 1e-30)
-    hanging = ~seen
-    hanging[hanging] = _is_apart(means, reach, peak, np.flatnonzero(hanging))
-    kinds = np.where(hanging, np.where(peak < HAZE, 3, 4), 0)
+    hanging = np.flatnonzero(~seen)
+    hanging = hanging[_is_apart(gaussians, peak, hanging)]
+    kinds = np.zeros(count, np.int8)
+    kinds[hanging] = np.where(peak[hanging] < HAZE, 3, 4)
     return np.where(peak <= 0, 1, np.where(peak < FAINT, 2, kinds)).astype(np.int8)
 
 
 def _is_apart(
-    means: Float[np.ndarray, "n 3"],
-    reach: Float[np.ndarray, " n"],
-    peak: Float[np.ndarray, " n"],
-    rows: Int[np.ndarray, " m"],
+    gaussians: Gaussians, peak: Float[np.ndarray, " n"], rows: Int[np.ndarray, " m"]
 ) -> Bool[np.ndarray, " m"]:
     """Tells which of some Gaussians overlap with fewer than `_COMPANY` others that are no haze."""
-    solid = np.flatnonzero(peak >= HAZE)
-    if not len(solid):
-        return np.ones(len(rows), bool)
-    distance, near = KDTree(means[solid]).query(means[rows], min(_NEIGHBOURS, len(solid)))
-    distance, others = (a.reshape(len(rows), -1) for a in (distance, solid[near]))
+    means, reach = np.asarray(gaussians.means, np.float32), np.exp(np.asarray(gaussians.log_scales).max(1))
+    solid = np.append(np.flatnonzero(peak >= HAZE), 0)  # the last stands for one that is missing, infinitely far
+    distance, near = KDTree(means[solid[:-1]]).query(means[rows], _NEIGHBOURS)
+    others = solid[near]
     touching = distance <= np.where(peak[rows] < HAZE, *_REACH)[:, None] * (reach[others] + reach[rows, None])
     return (touching & (others != rows[:, None])).sum(1) < _COMPANY
+
+
+def _open_views(gaussians: Gaussians, cameras: Camera) -> tuple[Callable, int]:
+    """Makes a function that returns `_view` of a view, and counts the views; those of a large scene are parts of views.
+
+    It takes which Gaussians are seen, the gap, and the number of the view.
+    """
+    if gaussians.count <= MAX_WHOLE:  # once for all views
+        whole = jax.device_put(dataclasses.replace(gaussians, sh=None))
+        return lambda seen, gap, t: _view(whole, seen, cameras[t], gap), len(cameras)
+    side, room = math.ceil(math.sqrt(gaussians.count / _PART)), [0, 0]
+    parts, visible = _divided(cameras, side), functools.lru_cache(1)(lambda t: visible_part(gaussians, cameras[t]))
+
+    def view(seen: np.ndarray, gap: float, t: int) -> tuple[np.ndarray, ...]:
+        rows, of_view = visible(t // side**2)
+        ids, part = visible_part(of_view, parts[t], least=room[0])
+        # The largest numbers of Gaussians and of their pairs so far, so that parts share programs.
+        room[:] = part.count, max(room[1], plan_capacity(part, parts[t], margin=1.0, devices=1))
+        inside, *columns = _view(part, np.pad(seen[rows[ids]], (0, part.count - len(ids))), parts[t], gap, room[1])
+        return rows[ids[inside]], *columns
+
+    return view, len(parts)
 
 
 def _divided(cameras: Camera, side: int) -> Camera:
@@ -105,20 +110,6 @@ def _divided(cameras: Camera, side: int) -> Camera:
     moved = [dataclasses.replace(cameras, cx=cameras.cx - x, cy=cameras.cy - y) for x in starts[0] for y in starts[1]]
     parts = jax.tree.map(lambda *parts: np.stack(parts, 1).reshape(-1, *parts[0].shape[1:]), *moved)
     return dataclasses.replace(parts, width=part[0], height=part[1])
-
-
-def _part(
-    rows: np.ndarray, whole: Gaussians, seen: np.ndarray, camera: Camera, gap: float, room: list[int]
-) -> tuple[np.ndarray, ...]:
-    """Does what `_view` does of a part of a view, which this sees.
-
-    `room` keeps the largest numbers of Gaussians and of their pairs, so that parts share programs.
-    """
-    ids, gaussians = visible_part(whole, camera, least=room[0])
-    room[0] = gaussians.count
-    room[1] = max(room[1], plan_capacity(gaussians, camera, margin=1.0, devices=1))
-    inside, *columns = _view(gaussians, np.pad(seen[rows[ids]], (0, room[0] - len(ids))), camera, gap, room[1])
-    return rows[ids[inside]], *columns
 
 
 def _view(

@@ -129,7 +129,7 @@ def _hold_out(frames: Sequence[_Frame], options: FrameOptions) -> tuple[Bool[np.
 
 def _file(frame: _Frame) -> ImageFile:
     """The image of a frame as `Capture.files` has it."""
-    return ImageFile(frame.posed.name, *frame.lens.undistorted_size, frame.orientation, frame.lens.view)
+    return ImageFile(frame.posed.name, *frame.lens.undistorted_size, frame.orientation)
 
 
 def _in_order(posed: PosedImages) -> tuple[list[_Frame], list[str]]:
@@ -253,7 +253,7 @@ def build_capture(posed: PosedImages, options: FrameOptions, *, progress: Progre
             maps = cached_maps(lens, pinholes[lens]) if lens.distorted else None
             pixels[t] = _undistort(image, lens, maps, (width, height))
             if ignored is not None:
-                ignored[t] = operator_mask(lens, pinholes[lens].resized(width, height))
+                ignored[t] = lens.view is not None and operator_mask(lens, pinholes[lens].resized(width, height))
             if (mask := frames[t].posed.mask) is not None and ignored is not None:
                 kept = read_image(mask, upright=first.orientation != 1)
                 kept = cv2.resize(kept, first.size, interpolation=cv2.INTER_NEAREST_EXACT)

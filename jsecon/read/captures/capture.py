@@ -19,7 +19,7 @@ from jsecon.read.captures import colmap, nerfstudio, opensfm, rgbd
 from jsecon.read.captures.build import build_capture
 from jsecon.read.captures.frames import FrameOptions, PosedImage, PosedImages
 from jsecon.read.captures.images import IMAGE_SUFFIXES, image_header, unread_remedy
-from jsecon.read.captures.lens import PANORAMA_VIEWS, Lens, panorama_lens
+from jsecon.read.captures.lens import PANORAMA_VIEWS, panorama_lens
 from jsecon.read.captures.video import has_panorama_mark, is_video
 from jsecon.read.registry import SCENES, Reader, readers
 from jsecon.types import Capture, Progress
@@ -85,23 +85,22 @@ def read_posed_images(path: Path) -> PosedImages:
         return _cut_panoramas(reader.read(path))
 
 
-def _cut_view(panorama: PosedImage, lens: Lens, view: int) -> PosedImage:
+def _cut_view(panorama: PosedImage, view: int) -> PosedImage:
     """A view of a panorama."""
     pose, path = panorama.world_to_camera.copy(), PurePosixPath(panorama.name)
     pose[:3] = PANORAMA_VIEWS[view] @ pose[:3]
     name = str(path.with_name(f"{path.stem}_{view}{path.suffix}"))
-    turned = dataclasses.replace(lens, view=view)
-    return dataclasses.replace(panorama, name=name, lens=turned, world_to_camera=pose, depth=None)
+    lens = panorama.lens and dataclasses.replace(panorama.lens, view=view)
+    return dataclasses.replace(panorama, name=name, lens=lens, world_to_camera=pose, depth=None)
 
 
 def _cut_panoramas(posed: PosedImages) -> PosedImages:
     """Replaces each panorama of a capture by its views, which share its file; their numbers follow its name."""
-    lenses = [(image, image.lens) for image in posed.images if image.lens is not None]
-    panoramas = [(image, lens) for image, lens in lenses if lens.panorama]
+    panoramas = [image for image in posed.images if image.lens is not None and image.lens.view is not None]
     if not panoramas:
         return posed
-    images = [image for image in posed.images if image.lens is None or not image.lens.panorama]
-    images += [_cut_view(*panorama, view) for panorama in panoramas for view in range(len(PANORAMA_VIEWS))]
+    images = [image for image in posed.images if image.lens is None or image.lens.view is None]
+    images += [_cut_view(panorama, view) for panorama in panoramas for view in range(len(PANORAMA_VIEWS))]
     each = f"{len(PANORAMA_VIEWS)} views each, of 95 degrees; what lies within 30 degrees of straight down is left out"
     note = f"{len(panoramas)} panoramas are cut into {each}, as the operator stands there."
     return dataclasses.replace(posed, images=images, notes=(*posed.notes, note))
@@ -192,15 +191,12 @@ def find_panoramas(photos: Sequence[Path], *, declared: bool) -> tuple[list[Path
 
     A panorama is twice as wide as high.
     """
-    found, unmarked = [], 0
-    for photo in photos:
-        width, height = image_header(photo).upright
-        if declared:
-            panorama_lens(photo, width, height)  # refuses another aspect
-        if width == 2 * height:
-            is_found = declared or has_panorama_mark(photo)
-            found += [photo] if is_found else []
-            unmarked += not is_found
+    sizes = {photo: image_header(photo).upright for photo in photos}
+    for photo, size in sizes.items() if declared else ():
+        panorama_lens(photo, *size)  # refuses another aspect
+    wide = [photo for photo, (width, height) in sizes.items() if width == 2 * height]
+    found = [photo for photo in wide if declared or has_panorama_mark(photo)]
+    unmarked = len(wide) - len(found)
     note = f"{unmarked} photographs are twice as wide as high, but their files do not call them panoramas."
     return found, (f"{note} Give --panoramas if they show all directions.",) if unmarked else ()
 

@@ -22,9 +22,8 @@ from jsecon.numerics import is_finite_and_bounded
 
 PANORAMA = "EQUIRECTANGULAR"
 """COLMAP's and nerfstudio's model of a panorama"""
-PANORAMA_VIEWS = Rotation.from_euler(
-    "YX", [*((-60 * view, 0) for view in range(6)), (0, 90), (0, -90)], degrees=True
-).as_matrix()
+_TURNS = [*((-60 * view, 0) for view in range(6)), (0, 90), (0, -90)]
+PANORAMA_VIEWS = Rotation.from_euler("YX", _TURNS, degrees=True).as_matrix()
 """(8, 3, 3) rotations from the axes of a panorama to those of its views: six along the horizon, one down and one up"""
 OPERATOR_DEGREES = 30.0
 """half angle of the cone straight below a panorama in which its tripod, or whoever carries it, is seen"""
@@ -50,10 +49,9 @@ class Lens:
     """OpenCV's order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 where `fisheye`; empty = pinhole."""
     fisheye: bool = False
     """equidistant model (Kannala and Brandt) instead of the polynomial one (Brown)."""
-    panorama: bool = False
-    """whether it is that of a panorama, whose focal lengths are px per radian, or of a view of one."""
     view: int | None = None
-    """row of PANORAMA_VIEWS, of a view of a panorama."""
+    """row of PANORAMA_VIEWS, of a view of a panorama, whose size this has and whose focal lengths are px per radian; 0
+    until the panorama is cut into views."""
 
     def __post_init__(self) -> None:
         """Raises ValueError if no image can have been taken with it."""
@@ -68,7 +66,7 @@ class Lens:
     @property
     def distorted(self) -> bool:
         """Whether its images must be resampled before they are those of a pinhole."""
-        return self.fisheye or self.panorama or any(k != 0 for k in self.distortion)
+        return self.fisheye or self.view is not None or any(k != 0 for k in self.distortion)
 
     @property
     def undistorted_size(self) -> tuple[int, int]:
@@ -88,23 +86,21 @@ def panorama_lens(where: object, width: int, height: int) -> Lens:
     """Makes the lens of a panorama; `where` names its file in the error of another aspect than 2:1."""
     if width != 2 * height:
         raise InputError(where, f"the panorama is {width}x{height}", "twice as wide as high", "Export all directions.")
-    return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, panorama=True)
+    return Lens(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, view=0)
 
 
 def operator_mask(lens: Lens, pinhole: Lens) -> Bool[np.ndarray, "h w"]:
-    """Marks the pixels of a panorama's view within the cone straight below it, and no pixel of another lens."""
-    if lens.view is None:
-        return np.zeros((pinhole.height, pinhole.width), bool)
-    directions = _directions(pinhole)
-    down = directions @ PANORAMA_VIEWS[lens.view][:, 1]
-    return down > np.cos(np.radians(OPERATOR_DEGREES)) * np.linalg.norm(directions, axis=-1)
+    """Marks the pixels of a panorama's view within the cone straight below it."""
+    directions = _panorama_directions(lens, pinhole)
+    return directions[..., 1] > np.cos(np.radians(OPERATOR_DEGREES)) * np.linalg.norm(directions, axis=-1)
 
 
-def _directions(pinhole: Lens) -> Float[np.ndarray, "h w 3"]:
-    """Directions of a pinhole's pixels in the camera's frame, z = 1."""
+def _panorama_directions(lens: Lens, pinhole: Lens) -> Float[np.ndarray, "h w 3"]:
+    """Directions of a view's pixels in the frame of its panorama."""
     columns = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     rows = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
-    return np.stack([*np.meshgrid(columns, rows), np.ones((pinhole.height, pinhole.width))], axis=-1)
+    of_view = np.stack([*np.meshgrid(columns, rows), np.ones((pinhole.height, pinhole.width))], axis=-1)
+    return of_view @ PANORAMA_VIEWS[lens.view or 0]
 
 
 def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -116,10 +112,6 @@ def _opencv(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 def _distort(lens: Lens, spatial: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Projects directions in the camera's frame, z = 1, into the distorted image, px."""
-    if lens.view is not None:
-        x, y, z = PANORAMA_VIEWS[lens.view].T @ spatial.T
-        rows = lens.cy + lens.fy * np.arctan2(y, np.hypot(x, z))
-        return np.stack([lens.cx + lens.fx * np.arctan2(x, z), rows.clip(0.5, lens.height - 0.5)], axis=-1)
     matrix, coefficients = _opencv(lens)
     if lens.fisheye:
         pixels = cv2.fisheye.distortPoints(np.ascontiguousarray(spatial[None, :, :2]), matrix, coefficients)
@@ -179,9 +171,10 @@ def undistorted_pinhole(lens: Lens, where: object) -> Lens:
 def undistortion_maps(lens: Lens, pinhole: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Computes where each pixel of the undistorted image lies in the distorted one: two tables for cv2.remap."""
     if lens.view is not None:
-        pixels = _distort(lens, _directions(pinhole).reshape(-1, 3)) - 0.5
-        columns, rows = pixels.T.reshape(2, pinhole.height, pinhole.width).astype(np.float32)
-        return columns, rows
+        x, y, z = np.moveaxis(_panorama_directions(lens, pinhole), -1, 0)
+        columns = lens.cx + lens.fx * np.arctan2(x, z) - 0.5
+        rows = lens.cy + lens.fy * np.arctan2(y, np.hypot(x, z)) - 0.5
+        return columns.astype(np.float32), rows.clip(0, lens.height - 1).astype(np.float32)
     matrix, coefficients = _opencv(lens)
     target, _ = _opencv(pinhole)
     make = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap

@@ -18,15 +18,8 @@ from jsecon.read.registry import Reader
 
 _REMEDY = "Run OpenSfM's reconstruct again."
 _PANORAMAS = ("spherical", "equirectangular")
-_DISTORTION = {
-    "perspective": ("k1", "k2"),
-    "simple_radial": ("k1",),
-    "radial": ("k1", "k2"),
-    "brown": ("k1", "k2", "p1", "p2", "k3"),
-    "fisheye": ("k1", "k2"),
-    "fisheye_opencv": ("k1", "k2", "k3", "k4"),
-}
-"""projection types of one centre -> OpenCV's coefficients, in its order"""
+_LENSES = ("perspective", "simple_radial", "radial", "brown", "fisheye", "fisheye_opencv")
+"""projection types that OpenCV has"""
 
 
 def _read_opensfm(path: Path) -> PosedImages:
@@ -51,13 +44,14 @@ def _lens(file: Path, name: str, camera: dict[str, Any]) -> Lens:
     model, width, height = camera["projection_type"], int(camera["width"]), int(camera["height"])
     if model in _PANORAMAS:
         return panorama_lens(file, width, height)
-    if model not in _DISTORTION:
+    if model not in _LENSES:
         raise ValueError(f"the projection_type {model} of camera {name} is not read: undistort the images first")
-    side, distortion = max(width, height), [float(camera.get(key, 0.0)) for key in _DISTORTION[model]]
+    side, is_fisheye = max(width, height), "fisheye" in model
+    order = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3")
+    distortion = tuple(float(camera.get(key, 0.0)) for key in order)
     fx, fy = (side * float(camera.get(key, camera.get("focal", 0.0))) for key in ("focal_x", "focal_y"))
     cx, cy = width / 2 + side * float(camera.get("c_x", 0.0)), height / 2 + side * float(camera.get("c_y", 0.0))
-    distortion += [0.0] * (4 - len(distortion))
-    return Lens(width, height, fx, fy, cx, cy, tuple(distortion), fisheye="fisheye" in model)
+    return Lens(width, height, fx, fy, cx, cy, distortion, is_fisheye)
 
 
 READERS = (Reader("OpenSfM", ("reconstruction.json",), _read_opensfm),)

@@ -74,16 +74,14 @@ def _missing_notes(video: Path, count: int, end: int, total: int) -> tuple[str, 
 
 
 def has_panorama_mark(path: Path) -> bool:
-    """Whether the first bytes of an image, or the header of a video, say that it is equirectangular."""
-    with path.open("rb") as file:
-        head = _read_header(path) if is_video(path) else file.read(1 << 18)
-    return _MARK.search(head) is not None
+    """Whether an image or a video says that it is equirectangular."""
+    return _MARK.search(_read_header(path)) is not None
 
 
 def _read_header(video: Path) -> bytes:
-    """The first and the last bytes of a video: what describes it lies before or behind the pixels."""
+    """The first and the last bytes of a video or an image: what describes it lies before or behind the pixels."""
     with video.open("rb") as file:
-        head = file.read(1 << 16)
+        head = file.read(1 << 18)
         file.seek(max(len(head), os.path.getsize(video) - (1 << 24)))
         return head + file.read()
 

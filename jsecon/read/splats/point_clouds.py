@@ -61,11 +61,11 @@ def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray,
         packed = np.ascontiguousarray(columns["rgb"]).view(np.uint32)
         return (packed[:, None] >> np.array([16, 8, 0], np.uint32)).astype(np.uint8)
     for names in _COLOURS:
-        if all(name in columns for name in names) and any(columns[name].any() for name in names):
-            values = np.stack([columns[name] for name in names], axis=1)
+        values = np.array([columns[name] for name in names if name in columns])
+        if len(values) == 3 and values.any() and not (values < 0).any():  # others are normals
             shares = values.dtype.kind == "f" and np.nanmax(values) <= 1
             top = 1 if shares else 255 if np.nanmax(values) <= 255 else 65535
-            return np.rint(np.clip(np.nan_to_num(values) * (255 / top), 0, 255)).astype(np.uint8)
+            return np.rint(np.clip(np.nan_to_num(values) * (255 / top), 0, 255)).astype(np.uint8).T
     for name in _INTENSITIES:
         if name in columns and columns[name].any():
             low, high = np.nanquantile(columns[name], [0.01, 0.99])
@@ -76,20 +76,15 @@ def _colours(columns: Mapping[str, np.ndarray], count: int) -> UInt8[np.ndarray,
 
 def _require_counts(path: Path) -> None:
     """Checks that a .las or .laz can hold what it claims: decoders take memory for all of it, or end the process."""
-    with path.open("rb") as file:
-        head = file.read(375)
-        minor, points_at, records = struct.unpack_from("<25xB70xII", head)
-        counts = [records, struct.unpack_from("<I", head, 243)[0] if minor >= 4 else 0]
-        head += file.read(max(points_at + 8 - len(head), 0))
-        if (laszip := head.find(b"laszip encoded")) >= 0:
-            (place,) = struct.unpack_from("<q", head, points_at)
-            if place == -1:  # it was not known before the end
-                file.seek(-8, 2)
-                (place,) = struct.unpack("<q", file.read(8))
-            file.seek(place)
-            chunk = struct.unpack_from("<I", head, laszip + 64)[0]
-            counts += [struct.unpack("<4xI", file.read(8))[0], chunk if 1 << 22 < chunk < 2**32 - 1 else 0]
-    if max(counts) > path.stat().st_size:
+    data = np.memmap(path, np.uint8, "r").data
+    minor, points_at, records = struct.unpack_from("<25xB70xII", data)
+    counts = [records, struct.unpack_from("<I", data, 243)[0] if minor >= 4 else 0]
+    if (laszip := bytes(data[:points_at]).find(b"laszip encoded")) >= 0:
+        place = struct.unpack_from("<q", data, points_at)[0]
+        place = struct.unpack_from("<q", data, len(data) - 8)[0] if place == -1 else place  # unknown before the end
+        chunk = struct.unpack_from("<I", data, laszip + 64)[0]
+        counts += [struct.unpack_from("<4xI", data, place)[0], chunk if 1 << 22 < chunk < 2**32 - 1 else 0]
+    if max(counts) > len(data):
         raise ValueError(f"it claims {max(counts)} records")
 
 
@@ -129,9 +124,7 @@ def _read_xyz(path: Path) -> _PointCloud:
     table = np.loadtxt(path, delimiter=mark, skiprows=first, ndmin=2, encoding="utf-8-sig")
     names = re.split(r"[\s,;]+", lines[first - 1]) if first else []
     if len(names) != table.shape[1] or not {*"xyz"} <= {*names}:
-        colours = slice(4, 7) if table.shape[1] == 7 else slice(3, 6)
-        names = [*"xyz", *(["intensity"] if table.shape[1] in (4, 7) else [])]
-        names += "rgb" if table.shape[1] > 5 and (table[:, colours] >= 0).all() else ""
+        names = [*"xyz", *(["intensity"] if table.shape[1] in (4, 7) else []), *"rgb"]
     return _cloud(dict(zip(names, table.T)))
 
 
@@ -157,8 +150,8 @@ def load_point_cloud(path: Path) -> _PointCloud:
         if reader is None:
             raise ValueError(f"{path.suffix or 'no suffix'} is none of .las, .laz, .e57, .pcd, .xyz, .txt and .ply")
         cloud = reader.read(path)
-        if not len(cloud.points):
-            raise ValueError("it has no points")
+        if not np.isfinite(cloud.points).all(axis=1).any():
+            raise ValueError("it has no points with finite coordinates")
     return cloud
 
 
@@ -170,8 +163,6 @@ def gaussians_of_cloud(path: Path, most: int = MAX_GAUSSIANS) -> tuple[Gaussians
     points, colors = load_point_cloud(path)
     known = np.isfinite(points).all(axis=1)
     points, colors, notes = points[known], colors[known], ()
-    if not len(points):
-        raise InputError(path, "none of its points has finite coordinates", remedy="Export it again.")
     if len(points) > most:
         means, colors, voxel = voxel_means(points - points[0], colors, most)
         notes = (f"{len(points):,} points of {path.name} became {len(means):,} Gaussians, one per {voxel:.3g} units.",)
@@ -208,10 +199,10 @@ def save_point_cloud(
         raise InputError(source, "none of its points lies near the Gaussians", remedy="Check its world.")
     if path.suffix.lower() == ".ply":
         points, colors = load_point_cloud(source)
-        columns = [(axis, "double", points[rows, n]) for n, axis in enumerate("xyz")]
-        columns += [(name, "uchar", colors[rows, n]) for n, name in enumerate(_COLOURS[0])]
-        columns += [(name, "int", column) for name, column in ids.items()]
-        return write_vertices(path, columns)
+        kinds = [(axis, "<f8") for axis in "xyz"] + [(name, "<u1") for name in _COLOURS[0]]
+        kinds += [(name, "<i4") for name in ids]
+        table = np.rec.fromarrays([*points[rows].T, *colors[rows].T, *ids.values()], dtype=kinds)
+        return write_vertices(path, len(rows), kinds, [table])
     if source.suffix.lower() not in (".las", ".laz"):
         raise InputError(path, f"the points of {source.name} are no {path.suffix}", remedy="Write a .ply.")
     with decoding(source, "laspy") as laspy:

@@ -4,13 +4,14 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import expit
 
 from jsecon.errors import InputError, require_shape
 from jsecon.files import atomic_write
@@ -111,19 +112,22 @@ def _save_ply(
     rest_names = (f"f_rest_{index}" for index in range(3 * (gaussians.sh.shape[1] - 1)))
     names = (*POSITION, "nx", "ny", "nz", *DC, *rest_names, *OPACITY, *SCALE, *ROTATION)
     is_double = _needs_float64(gaussians, similarity)
-    kinds = ("double" if is_double and name in POSITION else "float" for name in names)
-    properties = [f"property {kind} {name}" for kind, name in zip(kinds, names)]
-    properties += [f"property int {name}" for name in ids]
+    kinds = [(name, "<f8" if is_double and name in POSITION else "<f4") for name in names]
+    blocks = (
+        _table(block, is_double, {name: np.asarray(column[rows]) for name, column in ids.items()})
+        for rows, block in _usable_blocks(path, gaussians, similarity)
+    )
+    write_vertices(path, gaussians.count, [*kinds, *((name, "<i4") for name in ids)], blocks)
+
+
+def write_vertices(path: Path, count: int, kinds: Sequence[tuple[str, str]], blocks: Iterable[np.ndarray]) -> None:
+    """Writes a .ply of vertices: names and NumPy's little endian types of their properties, and blocks of rows."""
+    words = {kind: word for word, kind in reversed(TYPES.items())}  # the old ones, which all programs know
+    properties = [f"property {words[kind[1:]]} {name}" for name, kind in kinds]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header\n"]
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(gaussians.count, properties))
-        for rows, block in _usable_blocks(path, gaussians, similarity):
-            block_ids = {name: np.asarray(column[rows]) for name, column in ids.items()}
-            file.write(_table(block, is_double, block_ids).tobytes())  # tofile hides a full disk
-
-
-def _header(count: int, properties: list[str]) -> bytes:
-    start = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    return "\n".join([*start, *properties, "end_header\n"]).encode()
+        file.write("\n".join(header).encode())
+        file.writelines(block.tobytes() for block in blocks)  # tofile hides a full disk
 
 
 def _needs_float64(gaussians: Gaussians, similarity: Float[Array, "4 4"] | None) -> bool:
@@ -155,16 +159,6 @@ def _table(block: Gaussians, is_double: bool, ids: Mapping[str, np.ndarray]) -> 
     return rows
 
 
-def write_vertices(path: Path, columns: Sequence[tuple[str, str, np.ndarray]]) -> None:
-    """Writes a .ply of vertices: names, types (a .ply's words) and columns of their properties."""
-    rows = np.empty(len(columns[0][2]), [(name, "<" + TYPES[kind]) for name, kind, _ in columns])
-    for name, _, column in columns:
-        rows[name] = column
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(rows), [f"property {kind} {name}" for name, kind, _ in columns]))
-        file.write(rows.tobytes())
-
-
 def _save_usda(
     path: Path,
     gaussians: Gaussians,
@@ -187,18 +181,17 @@ def _save_usda(
         file.write('    uniform token[] xformOpOrder = ["xformOp:translate"]\n')
         for number in np.unique(objects):
             rows = np.flatnonzero(objects == number)
-            labels = {name: int(column[rows[0]]) for name, column in ids.items()}
             name = names[int(number)] if 0 <= number < len(names) else ""
             word = re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_")
             prim = "rest" if number < 0 else f"object_{number:03d}{'_' * bool(word)}{word}"
-            data = [f"int {key} = {value}" for key, value in labels.items()]
+            data = [f"int {key} = {column[rows[0]]}" for key, column in ids.items()]
             data += [f"string name = {json.dumps(name, ensure_ascii=False)}"]
             file.write(f'\n    def ParticleField3DGaussianSplat "{prim}" (\n        customData = {{\n')
             file.writelines(f"            {line}\n" for line in data)
             file.write("        }\n    )\n    {\n")
             part = jax.tree.map(lambda a, rows=rows: np.asarray(a[rows]), gaussians)
-            columns = [block for _, block in _usable_blocks(path, part, similarity)]
-            part = jax.tree.map(lambda *blocks: np.concatenate(blocks), *columns)
+            part = part if similarity is None else transform_gaussians(part, similarity)
+            require_drawable(path, part, 0, "Remove these Gaussians first.")
             file.writelines(_attributes(dataclasses.replace(part, means=part.means - origin)))
             file.write("    }\n")
         file.write("}\n")
@@ -209,18 +202,15 @@ def _attributes(part: Gaussians) -> Iterator[str]:
     unit = part.quaternions / np.linalg.norm(part.quaternions, axis=1, keepdims=True)
     reach = 3 * np.exp(part.log_scales).max(1, keepdims=True)
     extent = np.stack([(part.means - reach).min(0), (part.means + reach).max(0)])
-    degree = math.isqrt(part.sh.shape[1]) - 1
-    with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-part.opacity_logits.astype(np.float64)))
-    harmonics = "radiance:sphericalHarmonics"
+    bands, harmonics = part.sh.shape[1], "radiance:sphericalHarmonics"
     yield from _array("float3[] extent", extent)
     yield from _array("point3f[] positions", np.asarray(part.means))
     yield from _array("quatf[] orientations", unit)
     yield from _array("float3[] scales", np.exp(part.log_scales))
-    yield from _array("float[] opacities", opacities)
+    yield from _array("float[] opacities", expit(part.opacity_logits.astype(np.float64)))
     yield from _array("color3f[] primvars:displayColor", np.clip(0.5 + C0 * part.sh[:, 0], 0, 1))
-    yield f"        uniform int {harmonics}Degree = {degree}\n"
-    size = f"(\n            elementSize = {part.sh.shape[1]}\n        )"
+    yield f"        uniform int {harmonics}Degree = {math.isqrt(bands) - 1}\n"
+    size = f"(\n            elementSize = {bands}\n        )"
     yield from _array(f"float3[] {harmonics}Coefficients", part.sh.reshape(-1, 3), size)
 
 
