@@ -1,15 +1,23 @@
-"""Masks that lie in others: their tree against a readable twin, its labels, and the files that hold such masks."""
+"""Masks that lie in others: their tree against a readable twin, its labels, the files that hold such masks, and a field
+that is asked for a part of a thing."""
 
+import dataclasses
 import json
+import shutil
 
 import cv2
 import numpy as np
 import pytest
+from balls import COLOURS, ring_of_balls
+from capture_files import run_cli, write_transforms
 from hypothesis import given, settings, strategies as st
 
+from jsecon import Capture, Region, open_scene, save_gaussians
 from jsecon.field.field import _is_tree
+from jsecon.field.tree import node_members, parts_above
 from jsecon.read.masks.masks import load_labels, load_nested_labels, load_proposals
 from jsecon.read.masks.nesting import CONTAINED, lies_in, nest_masks, split_parts
+from jsecon.splat.sh import C0
 
 SIZE = (48, 64)
 
@@ -239,3 +247,80 @@ def test_masks_apart_give_the_labels_of_an_image_of_ids(tmp_path_factory, seed):
     assert nested[0].ids == plain[0].ids
     assert (nested[1] == -1).all()
     assert split_parts(nested[0].labels, nested[1])["labels"] is nested[0].labels
+
+
+BALL_OF = np.repeat([0, 1, 2, 3], [2500, 1500, 1500, 1500])
+"""the disc, and the red, blue and green ball of each Gaussian of `ring_of_balls`"""
+
+
+@pytest.fixture(scope="module")
+def dumbbell(tmp_path_factory):
+    """Folder of a field, `out`: of a red ball with a blue one as its part, and a green one apart, on a disc."""
+    folder = tmp_path_factory.mktemp("dumbbell")
+    gaussians, cameras, frames, truth, _ = ring_of_balls()
+    colours = (COLOURS[BALL_OF].astype(np.float32) / 255 - 0.5) / C0
+    save_gaussians(folder / "balls.ply", dataclasses.replace(gaussians, sh=colours[:, None]))
+    for place, rows in (("capture", np.arange(0, 24, 3)), ("later", np.array([1, 2]))):
+        names = tuple(f"frame_{t:02d}" for t in rows)
+        capture = Capture(
+            frames=frames[rows],
+            cameras=cameras[rows],
+            points=np.zeros((0, 3), np.float32),
+            point_colors=np.zeros((0, 3), np.uint8),
+            held_out=np.zeros(len(rows), bool),
+            depths=None,
+            source_from_scene=np.eye(4),
+            names=names,
+        )
+        write_transforms(capture, folder / place)
+        for name, image in zip(names, truth[rows]):
+            for kind, balls in (("mug", (1, 2)), ("handle", (2,)), ("ball", (3,))):
+                write(folder / f"{place}_masks" / kind / f"{name}.png", np.isin(image, balls))
+    line = "run", folder / "capture", "--out", folder / "out", "--gaussians", folder / "balls.ply", "--holdout", 0
+    assert run_cli(*line, "--masks", folder / "capture_masks") == 0
+    return folder
+
+
+def test_given_masks_in_each_other_are_asked_as_found_ones_are(dumbbell, capsys):
+    scene = open_scene(dumbbell / "out")
+    field = scene.field
+    assert field.tree.tolist() == [-1, -1, 1]
+    assert field.part_nodes.tolist() == [2]
+    assert parts_above(field).tolist() == [-1, -1, 1]  # what a second click takes
+    is_red, is_blue = BALL_OF == 1, BALL_OF == 2
+    handle = scene.ask("the blue handle of the red mug")
+    assert (handle.by, handle.state) == ("relation", "found")
+    assert handle.objects[0].regions == (2,)
+    assert handle.mask[is_blue].mean() > 0.8  # some lie within, unseen
+    assert handle.mask[~is_blue].mean() < 0.02
+    mug = scene.ask("red")
+    assert int(mug.selection.region) == 1
+    assert mug.mask[is_red | is_blue].mean() > 0.8
+    assert mug.mask[~(is_red | is_blue)].mean() < 0.02
+    np.testing.assert_array_equal(
+        scene.ask(Region(2)).selection.mask, node_members(*map(np.asarray, (field.tree, field.leaf)), 2)
+    )
+    parts = scene.at_level(-1)
+    assert len(scene.objects()) < len(parts.objects())
+    assert parts.ask(Region(2)).mask[is_blue].mean() > 0.8
+    assert parts.ask(Region(1)).mask[is_red].mean() > 0.8
+    assert parts.ask(Region(1)).mask[is_blue].mean() < 0.1
+    assert run_cli("objects", dumbbell / "out", "--level", -1) == 0
+
+
+def test_votes_of_a_thing_are_the_sum_of_those_of_its_parts_and_the_rest(dumbbell):
+    scene = open_scene(dumbbell / "out")
+    whole, parts = np.asarray(scene.field.votes.dense()), np.asarray(scene.at_level(-1).field.votes.dense())
+    np.testing.assert_allclose(parts[:, 1] + parts[:, 2], whole[:, 1], rtol=1e-6)
+    np.testing.assert_allclose(parts[:, 0], whole[:, 0], rtol=1e-6)
+    assert (parts[:, 2] > 0).sum() > 1000
+
+
+def test_parts_of_a_scene_larger_than_memory_are_voted_for_on_disk_to_the_same_field(dumbbell, tmp_path, monkeypatch):
+    shutil.copytree(dumbbell / "out" / "cache", tmp_path / "cache")
+    next((tmp_path / "cache").glob("votes-*.safetensors")).unlink()
+    monkeypatch.setenv("JSECON_MEMORY", "1e-6")
+    line = "run", dumbbell / "capture", "--out", tmp_path, "--gaussians", dumbbell / "balls.ply", "--holdout", 0
+    assert run_cli(*line, "--masks", dumbbell / "capture_masks") == 0
+    leaves = [np.asarray(open_scene(folder).field.leaf) for folder in (tmp_path, dumbbell / "out")]
+    np.testing.assert_array_equal(*leaves)

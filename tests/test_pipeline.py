@@ -18,7 +18,7 @@ from jsecon.paper import autoencoder
 from jsecon.pipeline import cache, run as pipeline
 from jsecon.pipeline.progress import Console, Step
 
-STAGES = ("load", "gaussians", "objects", "regions", "votes", "held_out")
+STAGES = ("load", "gaussians", "objects", "regions", "parts", "votes", "held_out")
 
 
 class Recorder(Console):
