@@ -316,6 +316,16 @@ def test_votes_of_a_thing_are_the_sum_of_those_of_its_parts_and_the_rest(dumbbel
     assert (parts[:, 2] > 0).sum() > 1000
 
 
+def test_masks_of_added_frames_that_lie_in_others_open_no_region(dumbbell):
+    scene = open_scene(dumbbell / "out")
+    grown = scene.add(dumbbell / "later", masks=dumbbell / "later_masks")
+    assert grown.field.regions.count == 2
+    assert len(grown.field.names) == 10
+    pixels = np.asarray(grown.field.regions.pixel_counts)[1]
+    assert (pixels[[grown.field.names.index(name) for name in ("frame_01", "frame_02")]] > 0).all()
+    np.testing.assert_array_equal(grown.field.leaf, scene.field.leaf)
+
+
 def test_parts_of_a_scene_larger_than_memory_are_voted_for_on_disk_to_the_same_field(dumbbell, tmp_path, monkeypatch):
     shutil.copytree(dumbbell / "out" / "cache", tmp_path / "cache")
     next((tmp_path / "cache").glob("votes-*.safetensors")).unlink()
