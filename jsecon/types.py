@@ -342,8 +342,8 @@ class LanguageField:
     """metres of one unit of the capture files' world; None: not known."""
     tree: Array | None = None
     """(M,) int32 parent of each node, -1 at the top: nodes 0 .. R-1 are the regions, later ones unions of earlier ones,
-    and then parts of regions, each before its parent if that is a part too. None where masks came from files or a
-    tracker."""
+    and then parts of regions, each before its parent if that is a part too. None where a tracker found the regions, or
+    masks of files none of which lies in another."""
     leaf: Array | None = None
     """(N,) int32 smallest node of each Gaussian, -1 for none: a part of a region, or a region without parts."""
     part_regions: Regions | None = None

@@ -52,7 +52,7 @@ def test_run_writes_field_metrics_and_report_and_tells_its_plan(room, room_run, 
     assert {stage["status"] for stage in told["stages"]} == {"cached"}
     assert not (tmp_path / "out" / "field.safetensors").exists()
     plan = words.partition("Nothing was written.")[0].splitlines()[1:]
-    assert len(plan) == 6
+    assert len(plan) == 7
     told, words = _object(capsys, *line)
     assert words.splitlines()[1 : len(plan) + 1] == plan
     assert told["gaussians"] == run.field.gaussians.count

@@ -21,7 +21,7 @@ from jsecon.pipeline.objects import _TrainingView
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console, Step
 
-STAGES = ("load", "gaussians", "objects", "regions", "votes", "held_out")
+STAGES = ("load", "gaussians", "objects", "regions", "parts", "votes", "held_out")
 
 
 class Recorder(Console):

@@ -450,7 +450,7 @@ class Scene:
         if level < PARTS:
             raise InputError("level", f"{level}", "-1 for parts, 0 for objects, or more", "Give another level.")
         if self.field.tree is None:
-            problem = "the field has no tree of objects, as its masks were given or tracked"
+            problem = "the field has no tree of objects: its masks were tracked, or given and none lies in another"
             raise InputError("level", problem, remedy="Leave it out, or make the field with masks that jsecon finds.")
         return self._with(cut_field(self.field, level), None)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jsecon.errors import require
-from jsecon.field.membership import with_overlap
+from jsecon.field.membership import SHARE_THRESHOLD, vote_columns, with_overlap
 from jsecon.field.regions import unit_rows
 from jsecon.types import LanguageField, Regions, Votes
 
@@ -43,6 +43,18 @@ def _first_above(field: LanguageField, stops: Int[np.ndarray, " s"]) -> Int[np.n
     return node
 
 
+def voted_leaves(field: LanguageField, nodes: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Finds the smallest node of each Gaussian of a field, -1 if less than half of it lies in its strongest region.
+
+    It is the node that has most weight on the Gaussian without its parts, `nodes`, if that belongs to the region, and
+    else the region.
+    """
+    region, weight, seen = map(np.asarray, next(vote_columns(field.votes)))
+    top = np.concatenate([np.arange(field.regions.count), part_objects(field), [-1]])
+    leaf = np.where(top[nodes] == region, nodes, region)
+    return np.where(weight >= SHARE_THRESHOLD * seen, leaf, -1).astype(np.int32)
+
+
 def cut_field(field: LanguageField, level: int) -> LanguageField:
     """Takes another cut of the tree as the regions of a field: its parts (-1), or unions, each so many joins up.
 
@@ -62,7 +74,7 @@ def cut_field(field: LanguageField, level: int) -> LanguageField:
     require(level >= PARTS, "level", level, "-1 for parts, 0 for objects, or more for unions", "Give another level.")
     if level == 0:
         return field
-    remedy = "Make the field with masks that jsecon finds or proposals (run without --masks)."
+    remedy = "Make the field with masks that lie in each other, or with those that jsecon finds (run without --masks)."
     require(field.tree is not None, "level", level, "0, as this field has no tree of objects", remedy)
     tree, count = np.asarray(field.tree), field.regions.count
     pixels = np.zeros((len(tree), field.regions.pixel_counts.shape[1]), np.int32)

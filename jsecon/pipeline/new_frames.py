@@ -25,6 +25,7 @@ from jsecon.read.captures.capture import lone_photographs, read_posed_images
 from jsecon.read.captures.frames import FrameOptions, frame_names, move_capture, take_frames
 from jsecon.read.captures.images import encode_jpeg, read_image
 from jsecon.read.masks.masks import load_proposals
+from jsecon.read.masks.nesting import outermost
 from jsecon.splat.sh import C0
 from jsecon.types import Capture, LanguageField, Progress, Votes
 from jsecon.vision.classical import ClassicalSegmenter
@@ -147,7 +148,8 @@ def make_views(
     if masks is not None:
         size = field.cameras.height, field.cameras.width
         read = load_proposals(masks, list(capture.names), size, level=options.get("level", "l"))[0]
-        propose = lambda pixels, index: read(index)  # noqa: E731
+        outer = outermost if options.get("masks") and field.part_nodes is not None else np.asarray
+        propose = lambda pixels, index: outer(read(index))  # noqa: E731
     gaussians = jax.device_put(replace(field.gaussians, sh=None))  # as a run's, whose programs are compiled
     votes, views, opened = jax.tree.map(np.asarray, field.votes), {}, []
     held = (votes.labelled >= LABELLED_PART * SHARE_THRESHOLD * votes.total) & (votes.views > 0)

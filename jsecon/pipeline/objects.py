@@ -17,7 +17,7 @@ from jsecon.association.consensus import Objects, track_masks
 from jsecon.association.frame_superpixels import SceneSuperpixels
 from jsecon.errors import InputError
 from jsecon.field.columns import vote_blocks
-from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, scratch_folder, sum_evidence
+from jsecon.field.evidence import IGNORED, list_evidence, pack_evidence, region_votes, scratch_folder, sum_evidence
 from jsecon.field.regions import choose_crops, crop_geometry, join_views, region_embeddings, views_needed
 from jsecon.fit.start import points_from_depth
 from jsecon.networks.hub import PREFIX, Role, cached_address, catalogue
@@ -37,7 +37,8 @@ from jsecon.pipeline.stages import (
 )
 from jsecon.process import VIEWS_AT_ONCE, cores, memory_budget
 from jsecon.read.captures.frames import evenly_spaced
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import load_nested_labels, load_proposals
+from jsecon.read.masks.nesting import split_parts
 from jsecon.types import Camera, Capture, Codes, Gaussians, Progress, Regions
 from jsecon.views.placing import LEAST_GAIN, frames_by_need
 from jsecon.vision.classical import ClassicalSegmenter
@@ -100,8 +101,9 @@ def _plan_regions(context: RunContext) -> list[Stage]:
     task = f"embedded by {embedder!r} in {options.crops} views each, or more where these scatter, weighted by pixels"
     key_options = {"embedder": embedder} | context.key_options("crops")
     stages = [Stage("regions", task, _embed_objects, after=after, key_options=key_options, distributed=True)]
-    if options.masks is None and options.tracker is None:
-        task, after = f"parts of objects, in at most {min(options.crops, PART_CROPS)} views each", (*after, "regions")
+    if options.tracker is None:
+        kind = "parts of objects" if options.masks is None else "objects whose masks lie in others"
+        task, after = f"{kind}, in at most {min(options.crops, PART_CROPS)} views each", (*after, "regions")
         stages.append(Stage("parts", task, _embed_parts, after=after, key_options=key_options, distributed=True))
     return stages
 
@@ -176,11 +178,12 @@ def _read_masks(stage: StageInput) -> StageResult:
     frames, _ = _frames_of_vision(stage)
     folder, view = stage.context.options.masks, _TrainingView(stage.results.load, stage.context.options, frames)
     assert folder is not None
-    loaded = load_labels(folder, view.names, view.size, frames=view.mask_layout["frames"], progress=stage.progress)
+    how = {"frames": view.mask_layout["frames"], "progress": stage.progress}
+    loaded, parent = load_nested_labels(folder, view.names, view.size, **how)
     _clear_ignored(loaded.labels, view)
     _require_regions(loaded.labels, str(folder))
     notes = (f"{len(loaded.ids)} regions in the masks", *loaded.notes)
-    return StageResult(ObjectLabels(loaded.labels, frames), notes)
+    return StageResult(ObjectLabels(frames=frames, **split_parts(loaded.labels, parent)), notes)
 
 
 def _find_objects(stage: StageInput) -> StageResult:
@@ -284,8 +287,8 @@ def _embed_objects(stage: StageInput) -> StageResult:
 def _embed_parts(stage: StageInput) -> StageResult:
     """Embeds the parts of objects in the few views that show most of them."""
     context, objects = stage.context, stage.results.objects
-    assert objects.parts is not None
-    assert objects.part_nodes is not None
+    if objects.parts is None or objects.part_nodes is None:
+        return StageResult(None)
     view, count = _TrainingView(stage.results.load, context.options, objects.frames), len(objects.part_nodes)
     embed, most = context.models.embedder.embed_regions, min(context.options.crops, PART_CROPS)
     embeddings = np.zeros((count, stage.results.regions.embeddings.shape[1]), np.float32)
@@ -302,8 +305,8 @@ def _embed_parts(stage: StageInput) -> StageResult:
 def _accumulate_votes(stage: StageInput) -> StageResult:
     """Accumulates votes, on disk if they do not fit into memory; the votes are the same."""
     options, capture, scene = stage.context.options, stage.results.load, stage.results.gaussians
-    labels, folder = stage.results.objects.labels, stage.checkpoint.folder
-    frames = stage.results.objects.frames
+    objects, folder = stage.results.objects, stage.checkpoint.folder
+    labels, frames = objects.labels, objects.frames
     cameras, count = capture.cameras[frames], int(labels.max()) + 1
     if capture.ignored is not None:  # what stood before a Gaussian there says nothing of it
         labels = np.where(np.asarray(capture.ignored)[frames], IGNORED, labels)
@@ -321,10 +324,16 @@ def _accumulate_votes(stage: StageInput) -> StageResult:
         accumulated = sum_evidence(lists, scene.count, count, by_view=True, folder=where)
         with ThreadPoolExecutor(cores()) as pool:
             packed = tuple(pool.map(lambda view: pack_evidence(view, count), lists)) if options.ledger else ()
+    nodes = None
+    if objects.leaf is None and objects.parts is not None:
+        for part in objects.parts:  # of parts in parts, the smaller comes later
+            labels = np.where(part >= 0, part + np.int16(count), labels)
+        where = folder / "parts" if on_disk else None
+        nodes = region_votes(scene, cameras, labels, int(labels.max()) + 1, folder=where, **settings).regions[:, 0]
     unseen = int((np.asarray(accumulated.views) == 0).sum())
     if unseen:
         notes = (*notes, f"no frame sees {unseen} of {scene.count} Gaussians")
-    return StageResult((accumulated, packed), notes)
+    return StageResult((accumulated, packed, nodes), notes)
 
 
 def _compute_codes(stage: StageInput) -> StageResult:

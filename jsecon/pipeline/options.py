@@ -161,8 +161,9 @@ class MaskOptions:
 
     Attributes:
       masks: Folder of instance masks: an integer PNG or .npy per frame under the frame's name (0 is background), in
-        subfolders like the images' if those have some; or <object>/<frame>.png in black and white; or LangSplat's
-        _s.npy. Without it, jsecon finds the objects in the frames.
+        subfolders like the images' if those have some; or <object>/<frame>.png in black and white; or SAM's or COCO's
+        JSON with track_id or instance_id. Masks of parts may lie in those of wholes. Without it, jsecon finds the
+        objects in the frames.
       proposals: Folder of masks of single frames, to be brought together over the frames: <frame>.json of SAM's
         generator, a COCO file of all frames, LangSplat's _s.npy, PNGs or .npy, named like the masks of --masks.
       ignore: What is no part of the scene, such as "person, screen": a segmenter and an embedder find it in each frame.

@@ -21,6 +21,7 @@ from jsecon.field.field import load_field
 from jsecon.field.ledger import Ledger, LedgerView, camera_row
 from jsecon.field.ledger_file import save_with_ledger
 from jsecon.field.membership import normalise_votes
+from jsecon.field.tree import voted_leaves
 from jsecon.files import FIELD_FILE, exclusive_lock
 from jsecon.parallel import allgather_tree
 from jsecon.pipeline import cache
@@ -301,6 +302,8 @@ def join_field(results: Results, embedder: Embedder, provenance: str, options: O
         part_regions=None if results.parts is None else of_capture(results.parts),
         part_nodes=results.objects.part_nodes,
     )
+    if (nodes := results.votes[2]) is not None:
+        field = dataclasses.replace(field, leaf=voted_leaves(field, np.asarray(nodes)))
     return dataclasses.replace(field, up=field_up(field, options.up))
 
 

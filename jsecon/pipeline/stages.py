@@ -6,7 +6,7 @@
     gaussians  scene.plan_scene       load: fitted, or read from a file
     objects    objects.plan_objects   load, gaussians (--masks: load alone)
     regions    objects.plan_objects   load, objects
-    parts      objects.plan_objects   load, objects, regions, where masks have a tree
+    parts      objects.plan_objects   load, objects, regions, but with a tracker
     votes      objects.plan_objects   load, gaussians, objects
     codes      objects.plan_objects   regions, votes, with --paper
     held_out   scene.plan_scene       load, gaussians, if there are photographs
@@ -53,7 +53,7 @@ class ObjectLabels:
     tree: np.ndarray | None = None
     """(M,) int32 parent of each node, as `LanguageField.tree` has it."""
     leaf: np.ndarray | None = None
-    """(N,) int32 smallest node of each Gaussian, as `LanguageField.leaf` has it."""
+    """(N,) int32 smallest node of each Gaussian, as `LanguageField.leaf` has it; None where votes decide it."""
     parts: np.ndarray | None = None
     """(L, T, H, W) int16 part 0 .. P-1 at each pixel, -1 for none; parts that lie in each other are on other layers."""
     part_nodes: np.ndarray | None = None
@@ -73,8 +73,9 @@ class Results:
     """R regions of the training frames"""
     parts: Regions | None = None
     """P parts of the regions; None where masks have no tree"""
-    votes: tuple[Votes, tuple[np.ndarray, ...]]
-    """weight of each region on each Gaussian; and with a ledger the packed list of each view, of which it is the sum"""
+    votes: tuple[Votes, tuple[np.ndarray, ...], np.ndarray | None]
+    """weight of each region on each Gaussian; with a ledger the packed list of each view, of which it is the sum; and
+    where masks that were given nest, the node of most weight on each Gaussian, without its parts (N,)"""
     codes: Codes | None = None
     """codes of the paper, if the options ask for them"""
     held_out: Quality = Quality(np.zeros(0, int), np.zeros(0), np.zeros(0))

@@ -2,8 +2,8 @@
 
 `READERS` is the table of formats. A reader takes a file, the (width, height) of its frame's image and LangSplat's
 level. It returns ids (H, W), the same for the same object in every frame, 0 for no region (or negative: 0 is a region
-then); or a list of masks (H, W) of this frame alone, the best first, which may overlap. Other packages add readers by
-entry points in the group jsecon.masks.
+then); or masks (H, W) by such ids, which may overlap; or a list of masks (H, W) of this frame alone, the best first,
+which may overlap. Other packages add readers by entry points in the group jsecon.masks.
 
 A mask is named like its frame, `<frame>.png`, or like the image's whole name (`<frame>.jpg.png`, as COLMAP has it). It
 lies in the folder itself, or in subfolders named like those of the images (`cam0/<frame>.png`). Any other subfolders
@@ -18,7 +18,8 @@ LangSplat's `<frame>_s.npy` float32 (4, H, W) has ids by level, -1 = none, which
 JSON is a file a frame of SAM's generator or of SA-1B, or COCO's one file for all frames. A mask is run-length encoded
 or polygons. Run lengths are {"size": [H, W], "counts": ...}: runs of 0 and 1 in turn, 0 first, down the columns.
 `counts` is a list of them, or COCO's text of 6-bit digits, decoded here: that also checks that the runs fill the mask,
-and needs no compiled dependency. Polygons are [[x, y, x, y, ...], ...] in px of the image, and add up.
+and needs no compiled dependency. Polygons are [[x, y, x, y, ...], ...] in px of the image, and add up. Numbers by which
+all frames know an object are `track_id` (TAO's; CVAT has it among `attributes`) or `instance_id` (CocoVID's).
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from jsecon.read.captures.images import (
     whole_numbers,
     without_image_suffix,
 )
+from jsecon.read.masks.nesting import lies_in, nest_masks
 from jsecon.read.registry import Reader, readers
 from jsecon.types import ImageFile, Progress
 
@@ -54,8 +56,10 @@ _LARGEST = (255, 65535)
 
 AllFrames: TypeAlias = Mapping[str, ImageFile | None]
 """all frames of a capture in order, by name, each with its image or None"""
-ReadMasks: TypeAlias = Callable[[tuple[int, int]], tuple[Path, np.ndarray | list[np.ndarray]]]
-"""(width, height) of the image of a frame -> a file, and its ids (H, W), or masks (H, W), the best first"""
+FrameContent: TypeAlias = np.ndarray | dict[int, np.ndarray] | list[np.ndarray]
+"""ids (H, W) of a frame, or masks (H, W) by id, or masks of this frame alone, the best first"""
+ReadMasks: TypeAlias = Callable[[tuple[int, int]], tuple[Path, FrameContent]]
+"""(width, height) of the image of a frame -> a file, and what it holds"""
 _REMEDY = "Write them with SAM's scripts/amg.py --convert-to-rle, or as COCO polygons."
 _MASK = '{"size": [H, W], "counts": a text or a list}, or polygons of three corners or more'
 _JSON = 'a list of {"segmentation": ...}, or COCO\'s {"images", "annotations"}'
@@ -124,7 +128,7 @@ def _fill_polygons(polygons: list[Any], size: tuple[int, int]) -> Bool[np.ndarra
     return canvas.astype(bool)
 
 
-def _read_json_masks(file: Path, size: tuple[int, int], level: str) -> list[Bool[np.ndarray, "h w"]]:
+def _read_json_masks(file: Path, size: tuple[int, int], level: str) -> FrameContent:
     """The masks of one frame, the best first. Polygons are drawn on `size` (width, height), or on the file's."""
     content = read_json(file, _JSON, _REMEDY)
     with reading(file, _JSON, _REMEDY, problem="it holds no masks"):
@@ -133,23 +137,26 @@ def _read_json_masks(file: Path, size: tuple[int, int], level: str) -> list[Bool
         return _decode_records(file, list(content["annotations"]), image, size)[1]
 
 
-def _decode_records(file: Path, records: list[Any], image: Any, size: tuple[int, int]) -> tuple[Path, list[np.ndarray]]:
+def _decode_records(file: Path, records: list[Any], image: Any, size: tuple[int, int]) -> tuple[Path, FrameContent]:
     """The file, and the masks of its records, those with the best scores (SAM's stability times predicted IoU) first.
 
-    `image` is the record of the image in the file, whose size goes before `size`.
+    They are by id if each has one of its own. `image` is the record of the image in the file, whose size goes before
+    `size`.
     """
     size = (image["width"], image["height"]) if isinstance(image, dict) and "width" in image else size
     with reading(file, _JSON, _REMEDY, problem="a mask's score cannot be read"):
         scores = [float(r.get("predicted_iou", 1.0)) * float(r.get("stability_score", 1.0)) for r in records]
-    masks = []
+    masks, tracks = [], []
     for number in np.argsort(-np.asarray(scores), kind="stable"):
         with reading(f"{file}, mask {number}", _MASK, _REMEDY, problem="the mask cannot be read"):
-            segmentation = records[number]["segmentation"]
-            if isinstance(segmentation, dict):
-                masks.append(_decode_rle(segmentation))
-            elif segmentation != []:
-                masks.append(_fill_polygons(list(segmentation), size))
-    return file, masks
+            if (segmentation := records[number]["segmentation"]) == []:
+                continue
+            is_rle, attributes = isinstance(segmentation, dict), records[number].get("attributes")
+            masks.append(_decode_rle(segmentation) if is_rle else _fill_polygons(list(segmentation), size))
+            keys = records[number] | (attributes if isinstance(attributes, dict) else {})
+            tracks.append(keys.get("track_id", keys.get("instance_id")))
+    has_ids = len(masks) == len({track for track in tracks if isinstance(track, int)})
+    return file, dict(zip(tracks, masks)) if has_ids else masks
 
 
 def _open_coco(folder: Path, names: Mapping[str, Sequence[str]]) -> dict[str, ReadMasks] | None:
@@ -298,18 +305,16 @@ def _read_file(reader: Reader, path: Path, level: str, size: tuple[int, int]) ->
         return path, reader.read(path, size, level)
 
 
-def _read_objects(paths: dict[int, Path], size: tuple[int, int]) -> tuple[Path, Int[np.ndarray, "h w"]]:
-    """A file of a frame, and the ids of its objects, from 1 on: the first lies on top. `paths` are those by id."""
-    images = {number: read_label_image(file) for number, file in paths.items()}
-    ids = np.zeros(next(iter(images.values())).shape, np.int64)
-    for number, image in reversed(images.items()):
-        with reading(
-            paths[number], remedy="Name folders of cameras like those of the images; write objects at one size."
-        ):
+def _read_objects(paths: dict[int, Path], size: tuple[int, int]) -> tuple[Path, dict[int, Bool[np.ndarray, "h w"]]]:
+    """A file of a frame, and the masks of its objects by id. `paths` are those by id, from 1 on."""
+    masks = {}
+    for number, file in paths.items():
+        image = read_label_image(file)
+        with reading(file, remedy="Name folders of cameras like those of the images."):
             if len(values := np.unique(image[image > 0])) > 1:
                 raise ValueError(f"it has {len(values)} values besides 0, but its folder is that of an object")
-            ids[image > 0] = number
-    return next(iter(paths.values())), ids
+        masks[number] = image > 0
+    return next(iter(paths.values())), masks
 
 
 class _Source:
@@ -327,15 +332,16 @@ class _Source:
             note = f"{len(self.missing)} of {len(names)} frames have no masks (the first: {self.missing[0]})."
             self.notes.insert(0, note)
 
-    def read(self, name: str) -> tuple[Path, np.ndarray | list[np.ndarray]]:
+    def read(self, name: str) -> tuple[Path, FrameContent]:
         """A file of a frame, and its ids or masks (those that have pixels) at the size of the frames."""
         file = self.frames.get(name)
         size = (self.size[1], self.size[0]) if file is None else (file.width, file.height)
         path, stored = self.readers[name](size)
-        if not isinstance(stored, list):
+        if isinstance(stored, np.ndarray):
             return path, self._fit(path, stored, size)
-        masks = (self._fit(path, mask, size) for mask in stored)
-        return path, [mask for mask in masks if mask.any()]
+        numbered = stored.items() if isinstance(stored, dict) else enumerate(stored)
+        masks = {number: fit for number, mask in numbered if (fit := self._fit(path, mask, size)).any()}
+        return path, masks if isinstance(stored, dict) else list(masks.values())
 
     def _fit(self, path: Path, image: np.ndarray, upright: tuple[int, int]) -> np.ndarray:
         """Resizes the mask of a frame to (H, W); raises InputError for another aspect than `upright`."""
@@ -346,23 +352,29 @@ class _Source:
         return image if image.shape == self.size else resize_nearest(image, self.size[1], self.size[0])
 
 
-def load_labels(
+def load_labels(folder: str | Path, names: Sequence[str], size: tuple[int, int], **options: Any) -> _TrackedMasks:
+    """Reads masks as labels (H, W) of regions over T frames called `names`, as `load_nested_labels` does."""
+    return load_nested_labels(folder, names, size, **options)[0]
+
+
+def load_nested_labels(
     folder: str | Path,
     names: Sequence[str],
     size: tuple[int, int],
     *,
     frames: AllFrames | None = None,
     progress: Progress = lambda done, total: None,
-) -> _TrackedMasks:
-    """Reads masks as labels (H, W) of regions over T frames called `names`.
+) -> tuple[_TrackedMasks, Int[np.ndarray, " r"]]:
+    """Reads masks as labels (H, W) of regions over T frames called `names`, and the parent of each (`nest_masks`).
 
-    Ids mean the same object in every frame. A frame without a mask is -1 everywhere. `frames` are all frames of the
-    capture in order, each with its image.
+    Ids mean the same object in every frame. A frame without a mask is -1 everywhere. Of masks that overlap, one
+    that lies in another is on top, and else the one of the smallest id. `frames` are all frames of the capture in
+    order, each with its image.
     """
     source = _Source(Path(folder), names, size, frames, "l")
     labels = np.full((len(names), *size), -1, np.int16)
     frame_ids: list[np.ndarray] = []
-    has_negative = False
+    nesting, has_negative = {}, False
     for t, name in enumerate(names):
         ids = np.zeros(0, np.int64)
         if name not in source.missing:
@@ -370,8 +382,15 @@ def load_labels(
             if isinstance(stored, list):
                 remedy = "Give masks of single frames as --proposals."
                 raise InputError(path, "its masks are of a single frame", "ids of objects in all frames", remedy)
-            has_negative |= bool(stored.min() < 0)
-            ids, labels[t] = compact_ids(path, stored)
+            if isinstance(stored, dict):
+                ids, has_negative = np.array(sorted(stored), np.int64), True
+                masks = np.stack([np.zeros(size, bool), *(stored[number] for number in ids)])[1:]
+                nesting[t] = lies_in(masks)
+                for row in np.lexsort((-ids, nesting[t][0].sum(1))):
+                    labels[t][masks[row]] = row
+            else:
+                has_negative |= bool(stored.min() < 0)
+                ids, labels[t] = compact_ids(path, stored)
         frame_ids.append(ids)
         progress(t + 1, len(names))
     ignored, ignored_notes = _find_ignored([*zip(frame_ids, labels)])
@@ -382,12 +401,15 @@ def load_labels(
         raise InputError(folder, f"there are {len(ids)} regions", f"at most {_MAX_REGIONS}", "Take fewer frames.")
     for frame, table in zip(labels, tables):
         frame[:] = np.append(table, -1).astype(np.int16)[frame]
+    parent = nest_masks([(tables[t], *found) for t, found in nesting.items()], len(ids))
     notes = [*source.notes, *ignored_notes]
+    if count := np.count_nonzero(parent >= 0):
+        notes.append(f"The masks of {count} of the {len(ids)} regions lie in those of others, as parts.")
     things = np.median([_count_things(frame) for frame in labels])
     if len(ids) > 10 * max(things, 1):
         hint = f"There are {len(ids)} ids, but a frame shows some {things:.0f} connected things."
         notes.append(f"{hint} Give masks that each frame numbers anew as --proposals; export smoothed colours again.")
-    return _TrackedMasks(labels, tuple(map(int, ids)), tuple(notes))
+    return _TrackedMasks(labels, tuple(map(int, ids)), tuple(notes)), parent
 
 
 def load_proposals(
@@ -409,6 +431,7 @@ def load_proposals(
         if names[index] in source.missing:
             return np.zeros((0, *size), bool)
         path, stored = source.read(names[index])
+        stored = list(stored.values()) if isinstance(stored, dict) else stored
         if not isinstance(stored, list):
             ids, labels = compact_ids(path, stored)
             ignored, _ = _find_ignored([(ids, labels)])
