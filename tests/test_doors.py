@@ -33,6 +33,7 @@ TEXTS = (
     "what is left of the dark green bottle",
     *("the orange ball directly above the white plate", "where is the white plate", "is there a red mug"),
     *("the orange ball on the dark blue box", "'red mug left of green'", "all red mugs"),
+    "red mug; white plate",  # one question, also on a page
 )
 REFUSED = {"the second red mug": "'second'", "the red mug opposite the white plate": "'opposite'",
            "the red mug 5 m left of the white plate": "'5 m left of'", "the other red mug": "'other'"}  # fmt: skip
@@ -61,6 +62,11 @@ def rows_of_mask(packed) -> list[int]:
     """The Gaussians of a mask as the pages have it."""
     bits = np.unpackbits(np.frombuffer(base64.b64decode(packed), np.uint8), bitorder="little")
     return np.flatnonzero(bits).tolist()
+
+
+def content_of(page) -> dict:
+    """What a page has of its scene."""
+    return json.loads(re.search(r'id="scene-data">(.*?)</script>', page)[1])
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +159,7 @@ def test_tools_of_language_models(door, find):
 def test_the_viewers_page(door, tmp_path):
     scene, file, rows = door
     assert run_cli("view", file, *TEXTS, "--export", tmp_path / "page.html") == 0
-    page = (tmp_path / "page.html").read_text()
-    content = json.loads(re.search(r'id="scene-data">(.*?)</script>', page)[1])
+    content = content_of((tmp_path / "page.html").read_text())
     assert content["count"] == scene.field.gaussians.count
     assert [*content["texts"]] == [*TEXTS]
     for text, shown in content["texts"].items():
@@ -162,7 +167,8 @@ def test_the_viewers_page(door, tmp_path):
 
 
 def test_the_served_page(door):
-    asked = TestClient(page_application(door[0]), "http://127.0.0.1:8766")
+    asked = TestClient(page_application(door[0], TEXTS), "http://127.0.0.1:8766")
+    assert [*content_of(asked.get("/").text)["texts"]] == [*TEXTS]
     for texts in (TEXTS[:20], TEXTS[20:]):
         answers = asked.post("/ask", json={"questions": texts}).json()["answers"]
         for text, shown in zip(texts, answers, strict=True):
