@@ -118,6 +118,18 @@ def write_text_model(capture: Capture, folder, cameras: list[str] | None = None)
     (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
 
 
+def write_mask(path, image) -> None:
+    """Numbers of pixels as a PNG, of 16 bits where 8 do not hold them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.asarray(image, np.uint8 if np.max(image) < 256 else np.uint16))
+
+
+def run_lengths(mask: np.ndarray) -> dict:
+    """COCO's uncompressed run lengths: down the columns, of 0 first."""
+    flat = np.concatenate([[False], mask.T.ravel()])
+    return {"size": list(mask.shape), "counts": np.diff([0, *np.flatnonzero(np.diff(flat)), mask.size]).tolist()}
+
+
 def transforms(capture: Capture, ending: str = ".png", **more) -> dict:
     """The capture as a transforms.json with intrinsics a frame."""
     cameras, frames = capture.cameras, []

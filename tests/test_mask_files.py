@@ -6,9 +6,9 @@ import json
 import cv2
 import numpy as np
 import pytest
-from capture_files import refused
+from capture_files import refused, write_mask
 
-from jsecon.read.masks.masks import LEVELS, load_labels, load_proposals
+from jsecon.read.masks.masks import load_labels, load_nested_labels, load_proposals
 from jsecon.types import ImageFile
 
 NAMES = ("b", "a ä 図", "c")
@@ -17,37 +17,31 @@ RNG = np.random.default_rng(11)
 IDS = RNG.choice([0, 3, 7, 200], (3, *SIZE))
 
 
-def slow(images, none=0):
-    """Regions by sorted ids over all frames."""
-    ids = sorted({int(value) for image in images for value in image.ravel()} - {none})
-    table = {value: index for index, value in enumerate(ids)}
-    labels = [[[table.get(int(value), -1) for value in row] for row in image] for image in images]
-    return np.array(labels, np.int16), tuple(ids)
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_integers(tmp_path, dtype):
     """Frames are in another order than their files."""
     images = IDS * (1 if dtype == np.uint8 else 250)
     for name, image in zip(NAMES, images):
-        write(tmp_path / f"{name}.png", image)
+        write_mask(tmp_path / f"{name}.png", image)
     calls = []
-    labels, ids, notes = load_labels(tmp_path, NAMES, SIZE, progress=lambda *call: calls.append(call))
-    expected, expected_ids = slow(images)
-    np.testing.assert_array_equal(labels, expected)
-    assert (labels.dtype, ids, notes) == (np.int16, expected_ids, ())
+    found = load_nested_labels(tmp_path, NAMES, SIZE, progress=lambda *call: calls.append(call))
+    (labels, ids, notes), parent = found
+    assert (parent == -1).all()
+    none, *expected = np.unique(images).tolist()
+    np.testing.assert_array_equal(np.array([*expected, none])[labels], images)
+    assert (labels.dtype, ids, notes) == (np.int16, tuple(expected), ())
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_langsplat_levels(tmp_path, level):
+@pytest.mark.parametrize(("row", "level"), enumerate(("default", "s", "m", "l")))
+def test_langsplat_levels(tmp_path, row, level):
     levels = RNG.integers(-1, 4, (3, 4, *SIZE)) + np.arange(4)[:, None, None] * 4
     levels = np.where(levels % 4 == 3, -1, levels).astype(np.float32)
     for name, image in zip(NAMES, levels):
         np.save(tmp_path / f"{name}_s.npy", image)
         np.save(tmp_path / f"{name}_f.npy", np.zeros((16, 512), np.float32))
     read, notes = load_proposals(tmp_path, NAMES, SIZE, level=level)
-    for t, image in enumerate(levels[:, LEVELS.index(level)]):
+    for t, image in enumerate(levels[:, row]):
         np.testing.assert_array_equal(read(t), [image == number for number in np.unique(image[image >= 0])])
     assert notes == ()
     with refused("_s.npy", "single frame"):
@@ -66,11 +60,6 @@ def test_too_many_regions(tmp_path):
 
 
 FRAME = (12, 16)
-
-
-def write(path, image):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.asarray(image, np.uint8 if np.max(image) < 256 else np.uint16))
 
 
 def ids_image():
@@ -92,7 +81,7 @@ def test_folders_like_those_of_the_images_are_cameras(tmp_path, folders, alike, 
     paths = [f"{folders[n % 2]}/v{n // 2 if alike else n}" for n in range(4)]
     images = [ids_image() for _ in paths]
     for path, image in zip(paths, images):
-        write(tmp_path / f"{path}.png", image)
+        write_mask(tmp_path / f"{path}.png", image)
     files = photographs(*(f"{prefix}{path}.jpg" for path in paths))
     labels, ids, notes = load_labels(tmp_path, tuple(files), FRAME, frames=files)
     np.testing.assert_array_equal(labels, np.stack(images) - 1)
@@ -101,7 +90,7 @@ def test_folders_like_those_of_the_images_are_cameras(tmp_path, folders, alike, 
     np.testing.assert_array_equal(read(3), [images[3] == id for id in range(1, 5)])
     images = [255 * (RNG.random(FRAME) < 0.5) for _ in paths]  # one object
     for path, image in zip(paths, images):
-        write(tmp_path / f"{path}.png", image)
+        write_mask(tmp_path / f"{path}.png", image)
     labels, ids, _ = load_labels(tmp_path, tuple(files), FRAME, frames=files)
     np.testing.assert_array_equal(labels, np.stack(images) // 255 - 1)
     assert ids == (255,)
@@ -116,9 +105,10 @@ def test_other_folders_of_black_and_white_masks_are_objects(tmp_path, paths, pat
     for number, frames in enumerate(masks):
         for file, mask in zip(files.values(), frames):
             camera, _, name = file.path.removesuffix(".jpg").rpartition("/")
-            write(tmp_path / (pattern.format(object=number, camera=camera, name=name) + ".png"), mask)
-    labels, ids, notes = load_labels(tmp_path, tuple(files), FRAME, frames=files)
+            write_mask(tmp_path / (pattern.format(object=number, camera=camera, name=name) + ".png"), mask)
+    (labels, ids, notes), parent = load_nested_labels(tmp_path, tuple(files), FRAME, frames=files)
     assert ids == (1, 2)
+    assert (parent == -1).all()  # of objects that overlap by chance
     np.testing.assert_array_equal(labels, np.where(masks[0] > 0, 0, np.where(masks[1] > 0, 1, -1)))
     assert any("objects" in note for note in notes)
     read, _ = load_proposals(tmp_path, tuple(files), FRAME, frames=files)
@@ -129,7 +119,7 @@ def test_objects_are_in_some_of_the_frames_in_their_order_and_the_lower_id_lies_
     low, high = np.zeros((2, *FRAME), bool)
     low[1:8, 2:9] = high[5:11, 6:14] = True
     for frame, folder, mask in (("b", "obj_10", high), ("c", "obj_09", low), ("c", "obj_10", high)):
-        write(tmp_path / folder / f"{frame}.png", 255 * mask)
+        write_mask(tmp_path / folder / f"{frame}.png", 255 * mask)
     (tmp_path / "other").mkdir()
     labels, ids, notes = load_labels(tmp_path, tuple("bcf"), FRAME)
     assert ids == (1, 2)
@@ -143,7 +133,7 @@ def test_objects_are_in_some_of_the_frames_in_their_order_and_the_lower_id_lies_
 @pytest.mark.parametrize("width", [5, 16, 23, 31, 32, 47, 80])
 def test_resizing_takes_the_value_at_each_centre(tmp_path, width):
     image = RNG.integers(1, 9, (12 * width // 16 or 1, width))
-    write(tmp_path / "a.png", image)
+    write_mask(tmp_path / "a.png", image)
     labels, ids, _ = load_labels(tmp_path, ("a",), FRAME)
     rows = np.floor((np.arange(12) + 0.5) * len(image) / 12).astype(int)
     columns = np.floor((np.arange(16) + 0.5) * width / 16).astype(int)
@@ -156,8 +146,8 @@ def test_resizing_takes_the_value_at_each_centre(tmp_path, width):
 ])  # fmt: skip
 def test_what_a_mask_may_be_called(tmp_path, frame, file):
     image = ids_image()
-    write(tmp_path / file, image)
-    write(tmp_path / "b.png", image)
+    write_mask(tmp_path / file, image)
+    write_mask(tmp_path / "b.png", image)
     files = photographs(*(("cam0/a.jpg", "cam1/a.jpg") if frame == "cam0_a" else (f"{frame}.jpg",)), "b.jpg")
     labels, _, notes = load_labels(tmp_path, (frame, "b"), FRAME, frames=files)
     np.testing.assert_array_equal(labels, np.stack([image, image]) - 1)
@@ -166,11 +156,11 @@ def test_what_a_mask_may_be_called(tmp_path, frame, file):
 
 def test_masks_of_no_frame_and_kinds_that_are_not_read_are_named(tmp_path):
     for name in "abc":
-        write(tmp_path / f"{name}.png", ids_image())
+        write_mask(tmp_path / f"{name}.png", ids_image())
     with refused(tmp_path, "no mask called like a frame"):
         load_labels(tmp_path, ("d",), FRAME, frames=dict.fromkeys("abd"))
     for name in ("d.jpg", "d.tif"):
-        write(tmp_path / name[2:] / name, ids_image())
+        write_mask(tmp_path / name[2:] / name, ids_image())
         with refused(f"{name} is no PNG"):
             load_labels(tmp_path / name[2:], ("d",), FRAME)
 

@@ -5,35 +5,29 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pytest
-from capture_files import refused
+from capture_files import run_lengths
 from hypothesis import given, settings, strategies as st
 
-from jsecon.read.masks.masks import load_labels, load_proposals
+from jsecon.read.masks.masks import load_proposals
 
 SIZE = (20, 30)
-
-
-@pytest.fixture
-def masks():
-    """Three masks, the second inside of the first."""
-    found = np.zeros((3, *SIZE), bool)
-    found[0, 2:12, 3:20] = found[1, 4:8, 5:9] = found[2, 14:19, 10:28] = True
-    return found
 
 
 def records(masks, scores=None):
     """As scripts/amg.py of segment-anything writes them."""
     found = []
     for mask in masks:
-        rle = {"size": list(mask.shape), "counts": text_of(runs_of(mask))}
-        found.append({"segmentation": rle, "area": int(mask.sum())})
+        rle = run_lengths(mask)
+        found.append({"segmentation": rle | {"counts": text_of(rle["counts"])}, "area": int(mask.sum())})
     for record, score in zip(found, scores or []):
         record |= {"predicted_iou": score, "stability_score": 0.9}
     return found
 
 
-def test_json_of_sams_generator_may_overlap_and_is_ordered_by_score(tmp_path, masks):
+def test_json_of_sams_generator_may_overlap_and_is_ordered_by_score(tmp_path):
+    """Three masks, the second inside of the first."""
+    masks = np.zeros((3, *SIZE), bool)
+    masks[0, 2:12, 3:20] = masks[1, 4:8, 5:9] = masks[2, 14:19, 10:28] = True
     (tmp_path / "a.json").write_text(json.dumps(records(masks, [0.8, 0.95, 0.9])))
     (tmp_path / "b.json").write_text(json.dumps({"image": {"image_id": 1}, "annotations": records(masks)}))
     read, notes = load_proposals(tmp_path, ("a", "b", "c"), SIZE)
@@ -41,27 +35,6 @@ def test_json_of_sams_generator_may_overlap_and_is_ordered_by_score(tmp_path, ma
     np.testing.assert_array_equal(read(1), masks)
     assert read(2).shape == (0, *SIZE)
     assert notes == ("1 of 3 frames have no masks (the first: c).",)
-
-
-def test_langsplat_files_hold_one_layer(tmp_path, masks):
-    levels = np.full((4, *SIZE), -1, np.float32)
-    levels[3][masks[2]], levels[1][masks[1]] = 4, 0
-    np.save(tmp_path / "a_s.npy", levels)
-    for level, n in (("l", 2), ("s", 1)):
-        read, _ = load_proposals(tmp_path, ("a",), SIZE, level=level)
-        np.testing.assert_array_equal(read(0), masks[[n]])
-
-
-def test_masks_of_single_frames_are_no_tracked_ones(tmp_path, masks):
-    (tmp_path / "a.json").write_text(json.dumps(records(masks)))
-    with refused("a.json", "single frame", "--proposals"):
-        load_labels(tmp_path, ("a",), SIZE)
-
-
-def runs_of(mask) -> list[int]:
-    """Lengths of runs down the columns, of 0 first."""
-    flat = np.concatenate([[False], mask.T.ravel()])
-    return np.diff([0, *np.flatnonzero(np.diff(flat)), mask.size]).tolist()
 
 
 def text_of(runs) -> str:
@@ -97,5 +70,6 @@ def test_the_example_of_cocos_own_tests():
 def test_every_mask_comes_back(seed, height, width, density):
     rng = np.random.default_rng(seed)
     mask = np.kron(rng.random((height, width)) < density, np.ones((1, rng.integers(1, 9)), bool)) > 0
-    for counts in (runs_of(mask), text_of(runs_of(mask))):
-        np.testing.assert_array_equal(decoded({"size": list(mask.shape), "counts": counts}), mask)
+    rle = run_lengths(mask)
+    for counts in (rle["counts"], text_of(rle["counts"])):
+        np.testing.assert_array_equal(decoded(rle | {"counts": counts}), mask)
