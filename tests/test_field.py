@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from small_field import REGIONS, unit_rows
 
-from jsecon import InputError, check_field, load_field, save_field, train_autoencoder
+from jsecon import InputError, Regions, check_field, load_field, save_field, train_autoencoder
 from jsecon.field import field as module
 from jsecon.field.membership import with_overlap
 from jsecon.files import read_arrays, write_arrays
@@ -63,8 +63,12 @@ def bare(field):
 
 
 def with_tree(field):
+    """Of a union and a part."""
     leaf = np.arange(field.gaussians.count, dtype=np.int32) % REGIONS
-    return dataclasses.replace(field, tree=np.array([REGIONS, REGIONS, *[-1] * (REGIONS - 1)], np.int32), leaf=leaf)
+    tree = np.array([REGIONS, REGIONS, *[-1] * (REGIONS - 1), 0], np.int32)
+    of_part = Regions(field.regions.embeddings[:1], field.regions.pixel_counts[:1])
+    nodes = np.array([REGIONS + 1], np.int32)
+    return dataclasses.replace(field, tree=tree, leaf=leaf, part_regions=of_part, part_nodes=nodes)
 
 
 @pytest.mark.parametrize("changed", [with_coder, with_tree, empty, bare])
@@ -98,6 +102,7 @@ def test_fields_that_do_not_fit_together_are_not_written(field, tmp_path):
         ("save_field", {"codes": dataclasses.replace(codes, gaussians=codes.gaussians[:-1])}),
         ("save_field", {"codes": dataclasses.replace(codes, regions=codes.regions[:, :2])}),
         ("save_field", {"names": ("one",)}),
+        ("part_nodes", {"part_nodes": np.array([9], np.int32)}),
         ("save_field", {"votes": dataclasses.replace(votes, overlap=np.eye(REGIONS - 1))}),
         ("bfloat16", {"codes": dataclasses.replace(codes, autoencoder=jnp.ones(3, jnp.bfloat16))}),
     ):

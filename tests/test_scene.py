@@ -57,22 +57,6 @@ def test_a_field_without_harmonics_is_asked_and_measured_and_has_no_colours_to_e
         bare.export(tmp_path / "scene.ply")
 
 
-def test_a_node_of_the_tree_selects_the_gaussians_under_it():
-    field, embedder = table_field()
-    # The mugs and the bottle join step by step; the plate has two parts, of 40 and 80 Gaussians.
-    tree = np.array([6, 7, 6, -1, -1, -1, 7, -1, 3, 3], np.int32)
-    leaf = np.repeat(np.array([0, 1, 2, 8, 9, 4, 5], np.int32), (120, 120, 120, 40, 80, 120, 120))
-    scene = Scene(dataclasses.replace(field, tree=tree, leaf=leaf), embedder)
-    things = [scene.ask(Region(region)).mask for region in range(6)]
-    first, whole = Region(6), Region(7)
-    np.testing.assert_array_equal(scene.ask(first).mask, things[0] | things[2])
-    np.testing.assert_array_equal(scene.ask(whole).mask, things[0] | things[1] | things[2])
-    assert (scene.ask(whole).count, scene.ask(whole).as_dict()["region"]) == (1, 7)
-    assert scene.best_frames(scene.ask(whole), 1) == [0]
-    np.testing.assert_array_equal(scene.ask(Region(8)).mask | scene.ask(Region(9)).mask, things[3])
-    assert "there is no region 10" in str(scene.ask(Region(10)))
-
-
 @pytest.mark.parametrize(("question", "options", "problem"), [
     (At("nowhere", 1, 1), {}, "no such frame"), (At(0, 99, 200), {}, "outside the frame"),
     (At(0, 0, 0), {}, "no region lies under"), (Box(0, 500, 3, 600, 9), {}, "pixels of a frame of 100x80"),

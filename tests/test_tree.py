@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_field import KnownTexts, colour_field, make_field, unit_rows
 
-from jsecon import InputError, Regions, load_field, save_field
+from jsecon import InputError, Regions
 from jsecon.app.records import Region
 from jsecon.app.scene import Scene
 from jsecon.field.tree import cut_field, node_members, part_objects
@@ -141,6 +141,16 @@ def test_a_part_without_a_word_of_the_embedder_is_a_name(scene, cameras, field):
     np.testing.assert_array_equal(named.mask, plain.mask)
 
 
+@pytest.mark.parametrize("node", [6, 9, 7])
+def test_a_node_of_the_tree_selects_the_gaussians_under_it(scene_of_parts, field, node):
+    """A union, a part, and a part of that."""
+    answer = scene_of_parts.ask(Region(node))
+    np.testing.assert_array_equal(answer.selection.mask, node_members(field.tree, field.leaf, node))
+    assert (answer.count, answer.as_dict()["region"]) == (1, node)
+    assert len(scene_of_parts.best_frames(answer, 1)) == 1
+    assert "there is no region 10" in str(scene_of_parts.ask(Region(10)))
+
+
 def test_levels_are_scenes_of_the_same_gaussians(scene_of_parts, field):
     assert scene_of_parts.at_level(0) is scene_of_parts
     union = scene_of_parts.at_level(1)
@@ -153,14 +163,3 @@ def test_levels_are_scenes_of_the_same_gaussians(scene_of_parts, field):
     flat = Scene(dataclasses.replace(field, tree=None, leaf=None, part_regions=None, part_nodes=None))
     with pytest.raises(InputError, match="no tree"):
         flat.at_level(1)
-
-
-def test_parts_are_kept_in_the_file(field, tmp_path):
-    save_field(tmp_path / "field.safetensors", field)
-    loaded = load_field(tmp_path / "field.safetensors")
-    np.testing.assert_array_equal(loaded.part_nodes, field.part_nodes)
-    assert loaded.part_regions is not None
-    np.testing.assert_array_equal(loaded.part_regions.embeddings, field.part_regions.embeddings)
-    broken = dataclasses.replace(field, part_nodes=np.array([9, 10], np.int32))
-    with pytest.raises(ValueError, match="part_nodes"):
-        save_field(tmp_path / "broken.safetensors", broken)
