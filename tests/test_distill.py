@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from conftest import MANY
 from jax.test_util import check_grads
+from reference import weights_reference
 from small_field import REGIONS, labels_of, true_regions, unit_rows, votes_of
 
-from jsecon import distill_l1, distill_votes, plan_capacity, plan_view, render
+from jsecon import distill_l1, distill_votes, plan_capacity, plan_view
 from jsecon.paper.distill import rendered_l1
 
 KEY = jax.random.key(0)
@@ -98,18 +99,11 @@ def task(scene, cameras):
     return scene, cameras, labels, codes, members, plan_capacity(scene, cameras)
 
 
-def dense_weights(scene, cameras):
-    """(T, H W, N) alpha T of every Gaussian at every pixel, by rendering one-hot features."""
-    onehot = jnp.eye(scene.count)
-    draw = jax.jit(lambda camera: render(scene, camera, onehot, capacity=plan).features.reshape(-1, scene.count))
-    plan = plan_capacity(scene, cameras)
-    return np.stack([np.asarray(draw(cameras[t]), np.float64) for t in range(cameras.world_to_camera.shape[0])])
-
-
 def test_steps_equal_the_definition_in_float64(task):
     """Loss and four Adam steps, PyTorch's formula, from a dense matrix of weights; each step takes another view."""
     scene, cameras, labels, codes, _, _ = task
-    weights, flat = dense_weights(scene, cameras), np.asarray(labels).reshape(4, -1)
+    weights = np.stack([weights_reference(scene, camera).reshape(-1, scene.count) for camera in cameras])
+    flat = np.asarray(labels).reshape(4, -1)
     start = 0.1 * unit_rows(np.random.default_rng(2), scene.count, 3)
     got, history = distill_l1(scene, cameras, labels, codes, steps=4, key=KEY, init=start)
     truth, taken = np.asarray(codes, np.float64), []

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from balls import HEIGHT, WIDTH, ring_of_balls
+from reference import weights_reference
 from twin_files import evidence_of_tracks
 
 from experiments.baselines import lifting
@@ -17,7 +18,7 @@ from experiments.baselines.opengaussian import Schedule, train_opengaussian
 from experiments.datasets.ovs3d import box_of
 from experiments.protocols.opengaussian import most_similar_text, select_leaf, select_text
 from experiments.simulated_vision.embeddings import made_text_space
-from jsecon import InputError, plan_view, project
+from jsecon import InputError, plan_view
 from jsecon.evaluate.lerf import evaluate_labels
 from jsecon.read.masks.labels import LabelledFrame
 from jsecon.vision.protocols import CANONICAL
@@ -132,31 +133,17 @@ def test_backprojection_is_the_sum_over_all_pixels(world):
     np.testing.assert_allclose(np.asarray(lifted.weights.sum(1)).ravel(), votes.labelled, rtol=1e-4, atol=1e-4)
 
 
-def test_centre_weights_are_the_renderers(world):
-    """Each against its definition: all nearer Gaussians' alphas at the pixel that holds the centre."""
-    gaussians, camera = world[0].gaussians, world[0].cameras[0]
-    weight, pixel = (np.asarray(a) for a in lifting.centre_weights(plan_view(gaussians, camera)))
-    splats = jax.jit(project)(gaussians, camera)
-    centre, visible = np.asarray(splats.means_px, np.float64), np.asarray(splats.visible)
-    whitening, opacity = np.asarray(splats.whitening, np.float64), np.asarray(splats.opacities, np.float64)
-    order = np.argsort(np.asarray(splats.depths), kind="stable")
-    checked = 0
-    for n in np.random.default_rng(0).permutation(gaussians.count)[:300]:
-        x, y = np.floor(centre[n])
-        if not (visible[n] and 0 <= x < WIDTH and 0 <= y < HEIGHT):
-            assert pixel[n] == -1
-            assert weight[n] == 0
-            continue
-        assert pixel[n] == y * WIDTH + x
-        dx, dy = x + 0.5 - centre[:, 0], y + 0.5 - centre[:, 1]
-        u, v = whitening[:, 0] * dx + whitening[:, 1] * dy, whitening[:, 2] * dy
-        alpha = opacity * np.exp(-0.5 * (u * u + v * v))
-        alpha = np.where(visible & (alpha >= 1 / 255), np.minimum(alpha, 0.99), 0)
-        before = np.prod(1 - alpha[order[: np.flatnonzero(order == n)[0]]])
-        expected = alpha[n] * before if before * (1 - alpha[n]) > 1e-4 else 0
-        assert weight[n] == pytest.approx(expected, abs=2e-4)
-        checked += expected > 0.01
-    assert checked > 30
+def test_centre_weights_are_the_renderers(scene, camera):
+    """Those of the float64 twin at the pixel that holds the centre."""
+    plan = plan_view(scene, camera)
+    weight, pixel = (np.asarray(a) for a in lifting.centre_weights(plan))
+    splats = np.asarray(plan.splats)
+    x, y = np.floor(splats[:, :2]).astype(int).T
+    inside = (splats[:, 5] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    np.testing.assert_array_equal(pixel, np.where(inside, y * camera.width + x, -1))
+    expected = weights_reference(scene, camera).reshape(-1, scene.count)[pixel, np.arange(scene.count)]
+    np.testing.assert_allclose(weight, np.where(inside, expected, 0), atol=2e-4)
+    assert (weight > 0.01).sum() > 10
 
 
 def test_the_gate_keeps_the_heaviest():
