@@ -12,7 +12,7 @@ from table_field import UP, table_field
 
 import jsecon
 from jsecon import Regions, load_gaussians, save_field
-from jsecon.read.splats.ply import read_ply_file
+from jsecon.read.splats.ply import read_vertices
 from jsecon.vision.colours import ColourEmbedder
 
 EMBEDDER = ColourEmbedder()
@@ -203,11 +203,6 @@ def test_the_command_line_writes_a_table_records_and_a_page(field, file, tmp_pat
     assert page.count('class="card"') == len(catalogue)
     assert page.index("<summary>1 more") < page.index(listed[-1]["name"])  # it is folded
     assert all(row["name"] in printed and row["frames"][0] in page for row in listed)
-
-
-def read_vertices(path) -> np.ndarray:
-    data, header = read_ply_file(path)
-    return np.frombuffer(data, header.elements[0].dtype("<"), offset=header.start)
 
 
 def test_exported_objects_and_labels_are_those_of_the_catalogue(field, file, tmp_path):

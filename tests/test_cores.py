@@ -1,6 +1,5 @@
 """Any number of cores gives the same answers; and machines without Unix's modules give any."""
 
-import dataclasses
 import functools
 import os
 import subprocess
@@ -11,11 +10,10 @@ from pathlib import Path
 import compiling
 import numpy as np
 import pytest
-from small_field import make_field
+from small_field import colour_field
 
 from jsecon import Scene
 from jsecon.field.field import save_field
-from jsecon.vision.colours import ColourEmbedder
 
 TESTS = Path(__file__).resolve().parent
 PARTS = "votes", "image", "fit", "query"
@@ -69,12 +67,11 @@ def answers(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def asked(scene, cameras, tmp_path_factory) -> tuple[str, str]:
     """The file of a small field, and a colour that selects a part of it."""
-    embedder = ColourEmbedder()
-    field = dataclasses.replace(make_field(scene, cameras, dim=embedder.dim)[0], embedder=embedder.name)
+    field = colour_field(scene, cameras)
     file = tmp_path_factory.mktemp("asked") / "field.safetensors"
     save_field(file, field)
     words = ("red", "green", "blue", "orange", "pink")
-    return str(file), next(word for word in words if Scene(field, embedder).ask(word).mask.any())
+    return str(file), next(word for word in words if Scene(field).ask(word).mask.any())
 
 
 @pytest.fixture(scope="module")

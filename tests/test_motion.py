@@ -1,6 +1,5 @@
 """Poses of bare photographs: found up to a similarity, kept, gone on with, and refused where they can't be."""
 
-import importlib.util
 import os
 import shutil
 import sys
@@ -36,8 +35,7 @@ def photos(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(photos, tmp_path_factory):
     """What structure from motion finds, where it works, and the progress on the way."""
-    if importlib.util.find_spec("pycolmap") is None:
-        pytest.skip("no pycolmap")
+    pytest.importorskip("pycolmap")
     work, told = tmp_path_factory.mktemp("work"), []
     capture, notes = find_poses(photographs_of(photos[0]), work, progress=lambda *at: told.append(at))
     return capture, notes, work, told

@@ -1,7 +1,6 @@
 """Panoramas: cut into views of the right directions, of every format, with one pose; told from wide photographs."""
 
 import dataclasses
-import importlib.util
 import json
 
 import cv2
@@ -186,8 +185,7 @@ def test_a_video_of_panoramas_is_told_by_its_header(tmp_path, mark):
 
 
 def test_poses_of_panoramas_are_found(tmp_path):
-    if importlib.util.find_spec("pycolmap") is None:
-        pytest.skip("no pycolmap")
+    pytest.importorskip("pycolmap")
     draw, count = np.random.default_rng(3), 3
     walls = [cv2.resize(draw.integers(0, 256, (32, 32, 3), np.uint8), (384, 384)) for _ in range(6)]
     true = np.tile(np.eye(4), (count, 1, 1))

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from balls import HEIGHT, WIDTH, ious, ring_of_balls
+from balls import HEIGHT, WIDTH, ious
+from test_consensus import few_superpixels as few_superpixels, world as world  # fixtures
 
 from jsecon.association import frame_superpixels as association
 from jsecon.association.frame_superpixels import superpixels
@@ -8,19 +9,9 @@ from jsecon.paper.tracker import GeometricTracker
 
 
 @pytest.fixture(scope="module")
-def world():
-    return ring_of_balls()
-
-
-@pytest.fixture(scope="module")
 def tracker(world):
     gaussians, cameras, _, _, proposals = world
     return GeometricTracker(gaussians, cameras, proposals)
-
-
-@pytest.fixture(autouse=True)
-def few_superpixels(monkeypatch):
-    monkeypatch.setattr(association, "SUPERPIXELS_PER_FRAME", 60)
 
 
 def prompts_at(truth, t):
