@@ -15,7 +15,6 @@ from jsecon.app.querying import _write_answers
 from jsecon.pipeline.options import Options
 from jsecon.pipeline.progress import Console
 from jsecon.pipeline.sources import provenance
-from jsecon.read.splats.ply import read_vertices
 from jsecon.vision.colours import ColourEmbedder
 
 
@@ -32,10 +31,9 @@ def saved(scene, cameras, tmp_path_factory):
 
 def test_a_field_is_exported_in_the_world_of_its_source(saved, tmp_path):
     field, file = saved
-    means, out = np.add(field.gaussians.means, [2, 0, 0]), tmp_path / "scene.ply"
-    assert run_cli("export", file, "--out", out) == 0
-    np.testing.assert_allclose(load_gaussians(out).means, means, atol=2**-16)
-    np.testing.assert_array_equal(read_vertices(out)["object_id"], Scene(field).objects().labels)
+    assert run_cli("export", file, "--out", tmp_path / "scene.ply") == 0
+    found, means = load_gaussians(tmp_path / "scene.ply").means, np.add(field.gaussians.means, [2, 0, 0])
+    np.testing.assert_allclose(found, means, atol=2**-16)
 
 
 @pytest.mark.parametrize("embedder", ["colours-1", "clip-of-nowhere"])

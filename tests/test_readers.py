@@ -99,7 +99,6 @@ DAMAGE = {
     "colmap/text": [
         (put(CAMERAS, "1 EQUIRECTANGULAR 24 16 24 16"), "cameras.txt", "24x16", "twice as wide as high"),
         *((put(CAMERAS, f"1 {name} 24 16 24 16"), name, "image_undistorter") for name in ("NEW_FISHEYE", "FOV")),
-        (put(CAMERAS, "1 PINHOLE 24 16 0.9 0.9 0.5 0.5"), "cameras.txt", "give them in pixels"),
     ],
     "colmap/binary": [
         (numbers("sparse/0/cameras.bin", 12, "<i", 99), "cameras.bin", "99", "image_undistorter"),
