@@ -255,12 +255,6 @@ class Terminal(io.StringIO):
         self.isatty = lambda: tty
 
 
-@pytest.fixture
-def soon(monkeypatch):
-    """Progress is shown after a hundredth of a second."""
-    monkeypatch.setattr(progress, "QUIET_SECONDS", 0.01)
-
-
 def show(err, steps, sign):
     """Progress of a step that reports these counts, and goes on until `sign` is shown."""
     with Console(err=err).progress("votes") as progress:
@@ -270,7 +264,8 @@ def show(err, steps, sign):
 
 
 @pytest.mark.parametrize("tty", [True, False])
-def test_progress_is_one_line_on_a_terminal_and_several_elsewhere(soon, tty):
+def test_progress_is_one_line_on_a_terminal_and_several_elsewhere(monkeypatch, tty):
+    monkeypatch.setattr(progress, "QUIET_SECONDS", 0.01)
     counted, unknown = Terminal(tty), Terminal(tty)
     show(counted, [(1, 4), (4, 4), (1, 3), (2, 3)], "votes: 2 of 3, about 0 s left")
     show(unknown, [], "votes: 0 s so far")  # a step that reports no count

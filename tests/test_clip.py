@@ -32,17 +32,12 @@ def frame():
     return image
 
 
-@pytest.fixture(scope="module")
-def masks():
-    """Each quarter without its rim, and an empty mask."""
-    found = np.zeros((5, 40, 60), bool)
-    for n in range(4):
-        found[n, 20 * (n // 2) + 2 : 20 * (n // 2) + 18, 30 * (n % 2) + 2 : 30 * (n % 2) + 28] = True
-    return found
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_images_and_texts_meet_in_every_layout(folders, frame, masks, layout):
+def test_images_and_texts_meet_in_every_layout(folders, frame, layout):
+    """Of each quarter without its rim, and of an empty mask."""
+    masks = np.zeros((5, 40, 60), bool)
+    for n in range(4):
+        masks[n, 20 * (n // 2) + 2 : 20 * (n // 2) + 18, 30 * (n % 2) + 2 : 30 * (n % 2) + 28] = True
     embedder = ClipEmbedder(folders[layout])
     assert isinstance(embedder, Embedder)
     assert embedder.dim == 3

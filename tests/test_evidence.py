@@ -66,20 +66,14 @@ def ask(file, out, *options):
     return json.loads(next(out.glob("*.json")).read_text())
 
 
-def one_region(scene, cameras, means):
-    """A field with all Gaussians of `scene` in region 0, at other places."""
-    votes = lone_votes(np.zeros(len(means)), 1)
-    gaussians = dataclasses.replace(scene, means=np.asarray(means, np.float32))
-    names = tuple(f"frame_{t}" for t in range(4))
-    regions = Regions(np.eye(1, 8, dtype=np.float32), np.full((1, 4), 500))
-    return field_of(votes, regions, gaussians=gaussians, cameras=cameras, names=names)
-
-
 def test_a_thing_in_two_pieces_stays_whole_and_what_is_dropped_is_told(scene, cameras, tmp_path, capsys):
     rng = np.random.default_rng(0)
     places = np.repeat([[0, 0, 0], [1, 0, 0], [0, 30, 0]], [32, 26, 6], 0)  # two pieces, and six strays far away
     means = places + np.where(np.arange(64)[:, None] < 58, 0.05, 8) * rng.normal(size=(64, 3))
-    save_field(tmp_path / "field.safetensors", one_region(scene, cameras, means))
+    gaussians = dataclasses.replace(scene, means=np.asarray(means, np.float32))
+    own = {"gaussians": gaussians, "cameras": cameras, "names": tuple(f"frame_{t}" for t in range(4))}
+    regions = Regions(np.eye(1, 8, dtype=np.float32), np.full((1, 4), 500))
+    save_field(tmp_path / "field.safetensors", field_of(lone_votes(np.zeros(64), 1), regions, **own))
     told = ask(tmp_path / "field.safetensors", tmp_path / "out")
     assert told["count"] == 58
     assert told["outliers"] == {"dropped": 6, "selected": 64}

@@ -35,22 +35,6 @@ def labels(cameras):
 
 
 @pytest.fixture(scope="module")
-def expected(scene, cameras, labels):
-    """(N, R) votes, (T, N) totals, (N,) peak, (N,) views by brute force in float64."""
-    votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
-    peak, views = np.zeros(scene.count), np.zeros(scene.count, int)
-    for t in range(4):
-        weights = weights_reference(scene, cameras[t]).reshape(-1, scene.count)[labels[t].reshape(-1) != IGNORED]
-        counted = labels[t][labels[t] != IGNORED]
-        for r in range(REGIONS):
-            votes[:, r] += weights[counted == r].sum(0)
-        total[t] = weights.sum(0)
-        peak = np.maximum(peak, weights.max(0))
-        views += weights.sum(0) > 0
-    return votes, total, peak, views
-
-
-@pytest.fixture(scope="module")
 def cast(scene, cameras, labels):
     return region_votes(scene, cameras, labels, REGIONS, top=REGIONS, by_view=True)
 
@@ -71,8 +55,18 @@ def ball(count, views, width, height, *, opaque=0.0, seed=0):
     return gaussians_at(means, sizes, turns=turns, logit=logit), cameras
 
 
-def test_equals_the_oracles_weights(cast, expected):
-    votes, total, peak, views = expected
+def test_equals_the_oracles_weights(cast, scene, cameras, labels):
+    """By brute force in float64."""
+    votes, total = np.zeros((scene.count, REGIONS)), np.zeros((4, scene.count))
+    peak, views = np.zeros(scene.count), np.zeros(scene.count, int)
+    for t in range(4):
+        weights = weights_reference(scene, cameras[t]).reshape(-1, scene.count)[labels[t].reshape(-1) != IGNORED]
+        counted = labels[t][labels[t] != IGNORED]
+        for r in range(REGIONS):
+            votes[:, r] += weights[counted == r].sum(0)
+        total[t] = weights.sum(0)
+        peak = np.maximum(peak, weights.max(0))
+        views += weights.sum(0) > 0
     assert int(cast.overflow) == 0
     # float32, and alphas that fall on the other side of the 1/255 cut on single pixels
     np.testing.assert_allclose(cast.dense(), votes, rtol=2e-4, atol=0.02)

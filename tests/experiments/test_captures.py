@@ -37,8 +37,7 @@ def encode_depth(metres):
     return ((value << 3) | (value >> 13)).astype(np.uint16)
 
 
-@pytest.fixture
-def apc_folder(tmp_path):
+def test_apc_scene_is_read_as_documented(tmp_path):
     (tmp_path / "segm").mkdir()
     (tmp_path / "cam.info.txt").write_text(CAMERAS)
     for t in range(2):
@@ -52,11 +51,7 @@ def apc_folder(tmp_path):
         cv2.imwrite(str(tmp_path / f"{name}.color.png"), color)
         cv2.imwrite(str(tmp_path / f"{name}.depth.png"), encode_depth(depth))
         cv2.imwrite(str(tmp_path / "segm" / f"{name}.segm.png"), segment)
-    return tmp_path
-
-
-def test_apc_scene_is_read_as_documented(apc_folder):
-    capture, labels = apc_bin.load_apc(apc_folder, held_out_every=2, nearest_m=0.2)
+    capture, labels = apc_bin.load_apc(tmp_path, held_out_every=2, nearest_m=0.2)
     assert capture.names == ("frame-000000", "frame-000001")
     np.testing.assert_array_equal(capture.held_out, [False, True])
     np.testing.assert_array_equal(capture.frames[0, 0, 0], [200, 0, 0])

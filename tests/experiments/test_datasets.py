@@ -24,11 +24,6 @@ def twins(tmp_path_factory):
     return {name: write(tmp_path_factory.mktemp(name)) for name, write in writers.items()}
 
 
-@pytest.fixture
-def copy(twins, tmp_path):
-    return lambda name: shutil.copytree(twins[name], tmp_path / name)
-
-
 def edit(file, change):
     content = json.loads(file.read_text())
     change(content)
@@ -55,8 +50,8 @@ def test_lerf_comes_back(twins):
     assert (smaller.capture.cameras.width, smaller.frames[0].width) == (32, 64)
 
 
-def test_lerfs_missing_labels_are_told_and_a_polygon_outside_keeps_its_pair(copy):
-    folder = copy("lerf")
+def test_lerfs_missing_labels_are_told_and_a_polygon_outside_keeps_its_pair(twins, tmp_path):
+    folder = shutil.copytree(twins["lerf"], tmp_path / "lerf")
     first = folder / "label" / "figurines" / "frame_00001.json"
     category = json.loads(first.read_text())["objects"][0]["category"]
 

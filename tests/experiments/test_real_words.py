@@ -28,16 +28,6 @@ class MeanColour:
         return picture.mean((0, 1)).astype(np.uint8)
 
 
-@pytest.fixture(scope="module")
-def embedder(tmp_path_factory):
-    """The three classes are axes, the canonical phrases lie between them."""
-    file = tmp_path_factory.mktemp("words") / "vectors.npz"
-    names = [*NAMES, *CANONICAL, "dark ink"]
-    vectors = np.array([[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], *[[1, 1, 1, 1]] * 4, [0, 0, 1, 1]], np.float16)
-    np.savez(file, names=np.array(names), vectors=vectors)
-    return Conse(MeanColour(file), TextVectors(file), crop=Crop(margin=0.0), top=2)
-
-
 def test_conse_is_the_weighted_mean_of_the_most_probable_classes():
     rng = np.random.default_rng(0)
     weights, vectors = rng.random((5, 30)), rng.normal(size=(30, 8))
@@ -84,7 +74,13 @@ def test_a_crop_is_the_box_with_its_margin_within_the_frame(crop, shape, outside
     assert set(np.unique(rest)) == (set() if outside is None else {outside})
 
 
-def test_it_is_an_embedder_of_regions_and_texts(embedder):
+def test_it_is_an_embedder_of_regions_and_texts(tmp_path):
+    """The three classes are axes, the canonical phrases lie between them."""
+    names = [*NAMES, *CANONICAL, "dark ink"]
+    vectors = np.array([[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], *[[1, 1, 1, 1]] * 4, [0, 0, 1, 1]], np.float16)
+    file = tmp_path / "vectors.npz"
+    np.savez(file, names=np.array(names), vectors=vectors)
+    embedder = Conse(MeanColour(file), TextVectors(file), crop=Crop(margin=0.0), top=2)
     assert isinstance(embedder, Embedder)
     assert embedder.dim == 4
     np.testing.assert_allclose(embedder.canonical_phrases, 0.5, atol=1e-6)
