@@ -33,7 +33,7 @@ def test_integers(tmp_path, dtype):
     assert calls == [(1, 3), (2, 3), (3, 3)]
 
 
-@pytest.mark.parametrize(("row", "level"), enumerate(("default", "s", "m", "l")))
+@pytest.mark.parametrize(("row", "level"), [*enumerate(("default", "s", "m", "l"))])
 def test_langsplat_levels(tmp_path, row, level):
     levels = RNG.integers(-1, 4, (3, 4, *SIZE)) + np.arange(4)[:, None, None] * 4
     levels = np.where(levels % 4 == 3, -1, levels).astype(np.float32)
