@@ -35,7 +35,7 @@ default_role = "literal"
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = os.environ.get("JSECON_NOTEBOOKS", "cache")
-nb_execution_timeout = 170
+nb_execution_timeout = 600
 nb_merge_streams = True
 nb_execution_raise_on_error = True
 
