@@ -347,7 +347,7 @@ class LanguageField:
     leaf: Array | None = None
     """(N,) int32 smallest node of each Gaussian, -1 for none: a part of a region, or a region without parts."""
     part_regions: Regions | None = None
-    """P parts of regions that masks show alone, as a text names them; None where they are not known."""
+    """P parts of regions that masks show alone, or that have masks of their own; None where they are not known."""
     part_nodes: Array | None = None
     """(P,) int32 node of each of these parts."""
     history: tuple[Event, ...] = ()

@@ -80,6 +80,7 @@ def test_labels_of_things_and_parts_are_those_of_the_smallest_objects(count, see
         np.testing.assert_array_equal(split["labels"], labels)
         return
     things, tree, layers = split["labels"], split["tree"], split["parts"]
+    assert things.dtype == layers.dtype == np.int16
     count = int(things.max()) + 1
     assert _is_tree(tree, count)
     assert (tree[:count] == -1).all()

@@ -60,7 +60,8 @@ def split_parts(labels: Int16[np.ndarray, "t h w"], parent: Int[np.ndarray, " n"
     """
     if parent.max(initial=-1) < 0:
         return {"labels": labels}
-    depth, above, layers = np.zeros(len(parent), int), parent, []
+    parent = parent.astype(np.int16)  # images of labels are large
+    depth, above, layers = np.zeros_like(parent), parent, []
     while (above >= 0).any():
         depth, above = depth + (above >= 0), np.where(above >= 0, parent[above], -1)
     for level in range(depth.max(), 0, -1):
